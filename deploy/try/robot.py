@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from gateways.tcpudp.conformance.fragile_robot import FragileRobot
+from gateways.tcpudp.conformance.machine import Quirks
 
 
 class RecordingRobot(FragileRobot):
@@ -22,7 +23,7 @@ class RecordingRobot(FragileRobot):
     def __init__(self, account: Path) -> None:
         self._account, self._known = account.open("w", buffering=1), 0.0
         violated = partial(self.record, "violation:")
-        super().__init__(version="1.3", udp=False, seed=1, client_id=2, note=violated)
+        super().__init__(version="1.3", udp=False, seed=1, quirks=Quirks(client_id=2), note=violated)
         steer = self.machine.steer
 
         def obey(body: bytes) -> None:

@@ -7,10 +7,10 @@ fragile as deployed ones, which share no code with the rest.
 
 from __future__ import annotations
 
-from gateways.alf.hq import AlfHq, HqOptions
-from gateways.alf.messages import Dialect, codecs
-from gateways.alf.translate import NAME, AlfRobot, Options
-from zbridge.protocol import Address, ConfigError, HqSimulation, Protocol, Simulation
+from gateways.alf.hq import AlfHq, AlfHqOptions
+from gateways.alf.messages import AlfDialect, codecs
+from gateways.alf.translate import NAME, AlfOptions, AlfRobot
+from zbridge.protocol import ConfigError, HqSimulation, Protocol, Simulation
 
 LINKS = 2
 
@@ -34,7 +34,7 @@ listen = "tcp://127.0.0.1:6667"
 [hq.options]
 dialect = "text"                        # what programs in the field speak; "binary": the document's packed fields
 serve = "auto"                          # 1 and 2 until a client sends its first 3, from then on 4 and no 1; or always
-                                        # "drive", "laser", "both": no deployed program bears both kinds
+                                        # "drive", "laser", "both": no deployed program tolerates both
 points = 769                            # points of a measurement; scans of another number are resampled by angle
 # acceleration_m_s2 = 9.80665           # one unit of acceleration; left out: 1 g in text, 0.001 g in binary
 # gyro_rad_s = 0.017453292519943295     # one unit of gyro; left out: 1 degree/s in text, 0.1 in binary
@@ -42,11 +42,11 @@ gap_s = 0.0                             # least time between two messages
 """
 
 
-def _dialect(name: str | None) -> Dialect:
+def _dialect(name: str | None) -> AlfDialect:
     try:
-        return Dialect(name or "text")
+        return AlfDialect(name or "text")
     except ValueError:
-        names = ", ".join(dialect.value for dialect in Dialect)
+        names = ", ".join(dialect.value for dialect in AlfDialect)
         raise ConfigError(f"dialect {name!r}: expected one of {names}") from None
 
 
@@ -57,16 +57,11 @@ async def _simulate(simulation: Simulation) -> None:
         raise ConfigError(f"an ALF vehicle has at most {LINKS} links")
     dialect = _dialect(simulation.dialect)
     if simulation.fragile:
-        from gateways.alf.conformance.fragile_robot import simulate_fragile
+        from gateways.alf.conformance.fragile_robot import fragile_vehicle
 
-        host, port = simulation.addresses[0].host, simulation.addresses[0].port
-        laser = simulation.addresses[1].port if len(simulation.addresses) > 1 else None
-
-        def ready(drive_port: int, laser_port: int | None) -> None:
-            ports = (drive_port,) if laser_port is None else (drive_port, laser_port)
-            simulation.ready(tuple(Address(host, port) for port in ports))
-
-        await simulate_fragile(host, port, dialect=dialect.value, laser_port=laser, seed=simulation.seed, ready=ready)
+        links = len(simulation.addresses)
+        first, *others = fragile_vehicle(dialect.value, servers=links, seed=simulation.seed)
+        await first.simulate(simulation, *others)
     else:
         from gateways.alf.simulator import simulate
 
@@ -74,24 +69,25 @@ async def _simulate(simulation: Simulation) -> None:
 
 
 async def _simulate_hq(simulation: HqSimulation) -> None:
-    from gateways.alf.conformance.fragile_hq import simulate_fragile_hq
+    from gateways.alf.conformance.fragile_hq import FragileAlfHq
 
     if simulation.version is not None or simulation.udp:
         raise ConfigError("ALF HQ programs have no versions and no datagrams")
-    dialect = _dialect(simulation.dialect)
-    address = simulation.address
-    await simulate_fragile_hq(address.host, address.port, dialect=dialect.value, drive=simulation.drive)
+    dialect, address = _dialect(simulation.dialect), simulation.address
+    # What the listener is configured to serve is not known here.
+    hq = FragileAlfHq(dialect=dialect.value, serves="both", deployed="driving")
+    await hq.simulate(address.host, address.port, simulation.drive)
 
 
 PROTOCOL = Protocol(
     name=NAME,
     summary="ALF: a vehicle with a laser scanner",
-    options=Options,
+    options=AlfOptions,
     links=LINKS,
     robot=AlfRobot,
     simulate=_simulate,
     hq=AlfHq,
-    hq_options=HqOptions,
+    hq_options=AlfHqOptions,
     simulate_hq=_simulate_hq,
     template=TEMPLATE,
     codecs=codecs(),

@@ -13,18 +13,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from gateways.alf.messages import (
-    MOST_POINTS,
-    POINTS,
-    AlfMessage,
-    Dialect,
-    DriveCommand,
-    DriveInfo,
-    Measurement,
-    ScannerInit,
-    write_binary,
-    write_text,
-)
+from gateways.alf import messages
 from gateways.alf.session import VehicleRole
 from gateways.alf.translate import FULL_LOCK_DEG, NAME, UNITS, Scale
 from zbridge.fleet import topics
@@ -39,7 +28,7 @@ COUNTER_ENDS = 2**31
 """One more than the largest integer that deployed receivers can read."""
 FULL_INFO = 100
 """The speed of drive info at full scale."""
-_FULL_SPEED = {Dialect.TEXT: 255, Dialect.BINARY: 100}
+_FULL_SPEED = {messages.AlfDialect.TEXT: 255, messages.AlfDialect.BINARY: 100}
 """The speed that HQ programs send at full scale."""
 _MM_PER_M = 1000
 _RAW_16 = 32767
@@ -47,18 +36,18 @@ _RAW_16 = 32767
 Ints = npt.NDArray[np.int64]
 
 
-class HqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class AlfHqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[[hq]] options`` of this protocol; the template of ``zbridge init`` explains each."""
 
     dialect: Literal["text", "binary"] = "text"
     serve: Literal["auto", "drive", "laser", "both"] = "auto"
-    points: Annotated[int, msgspec.Meta(ge=2, le=MOST_POINTS)] = POINTS
+    points: Annotated[int, msgspec.Meta(ge=2, le=messages.MOST_POINTS)] = messages.POINTS
     acceleration_m_s2: Scale | None = None
     gyro_rad_s: Scale | None = None
     gap_s: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.0
 
 
-class HqClient(VehicleRole):
+class AlfClient(VehicleRole):
     """The session of one client.
 
     scanner: the scanner init that it was sent last, encoded. laser: whether it is shown measurements and scanner init.
@@ -81,7 +70,7 @@ class HqClient(VehicleRole):
         if self.scanner is not None:
             self.outbox.withdraw(self.scanner)
 
-    def know(self, scanner: bytes | None) -> None:
+    def send_scanner(self, scanner: bytes | None) -> None:
         """Send a scanner init that the client does not have yet, before any measurement that needs it."""
         if scanner is not None and scanner != self.scanner and self.laser:
             self.outbox.clear("scan")
@@ -121,7 +110,7 @@ class Sweep:
         if not all(map(math.isfinite, map(math.degrees, angles))):  # receivers cannot read NaN
             raise EncodeError(f"scanner with angles {angles}")
         self.init = write(
-            ScannerInit(
+            messages.ScannerInit(
                 math.degrees(angle_min),
                 math.degrees(angle_max),
                 math.degrees(increment),
@@ -131,7 +120,7 @@ class Sweep:
             )
         )
 
-    def measurement(self, scan: Scan, sequence: int) -> Measurement:
+    def measurement(self, scan: Scan, sequence: int) -> messages.Measurement:
         """Return a measurement: ranges in mm, 0 = not measured; valid indices: of the first and last range."""
         ranges = scan.ranges if self._places is None else scan.ranges[self._places]
         with np.errstate(invalid="ignore"):
@@ -141,7 +130,7 @@ class Sweep:
         points[valid] = points_mm[valid]
         first, last = (int(valid[0]), int(valid[-1])) if valid.size else (0, 0)
         stamp_ms = scan.device_ms if isinstance(scan.device_ms, int) else _stamp_ms(scan)
-        return Measurement(sequence % COUNTER_ENDS, stamp_ms % COUNTER_ENDS, points, first, last)
+        return messages.Measurement(sequence % COUNTER_ENDS, stamp_ms % COUNTER_ENDS, points, first, last)
 
 
 class AlfHq(HqSide):
@@ -152,11 +141,11 @@ class AlfHq(HqSide):
     kept: ClassVar[dict[str, Any]] = {"_sequence": int}
     deadman_s = DEADMAN_S
 
-    def __init__(self, options: HqOptions, view: RobotView, metrics: Metrics | None = None) -> None:
+    def __init__(self, options: AlfHqOptions, view: RobotView, metrics: Metrics | None = None) -> None:
         self.options = options
         self.view = view
-        self._dialect = Dialect(options.dialect)
-        self._write = write_text if self._dialect is Dialect.TEXT else write_binary
+        self._dialect = messages.AlfDialect(options.dialect)
+        self._write = messages.write_text if self._dialect is messages.AlfDialect.TEXT else messages.write_binary
         self._auto = options.serve == "auto"
         self._laser, self._drive = options.serve != "drive", options.serve != "laser"
         self.follows = (("scan", "scanner") if self._laser else ()) + (("motion",) if self._drive else ())
@@ -167,16 +156,16 @@ class AlfHq(HqSide):
         self._sweep: Sweep | None = None
         self._sequence = 0
 
-    def session(self, number: int, bounds: Limits) -> HqClient:
-        session = HqClient(self._dialect, points=self.options.points, gap_s=self.options.gap_s, bounds=bounds)
+    def session(self, number: int, bounds: Limits) -> AlfClient:
+        session = AlfClient(self._dialect, points=self.options.points, gap_s=self.options.gap_s, bounds=bounds)
         session.laser, session.drive = self._laser, self._drive and not self._auto
         return session
 
-    def begin(self, session: HqClient, now: float) -> None:
+    def begin(self, session: AlfClient, now: float) -> None:
         scan = self.view.scan
         known = scan if scan is not None and len(scan.ranges) else self.view.scanner
         if session.laser and known is not None:
-            session.know(self._sweep_of(known).init)
+            session.send_scanner(self._sweep_of(known).init)
 
     # What is shown
 
@@ -185,7 +174,7 @@ class AlfHq(HqSide):
             return self._measurement(message) if len(message.ranges) else None
         if isinstance(message, Scanner):
             init = self._sweep_of(message).init
-            return lambda session, now: session.know(init)
+            return lambda session, now: session.send_scanner(init)
         return self._info(message) if isinstance(message, Motion) else None
 
     def _sweep_of(self, known: Scan | Scanner) -> Sweep:
@@ -199,9 +188,9 @@ class AlfHq(HqSide):
         self._sequence = scan.seq if isinstance(scan.seq, int) else self._sequence + 1
         frame = self._write(sweep.measurement(scan, self._sequence))
 
-        def send(session: HqClient, now: float) -> None:
+        def send(session: AlfClient, now: float) -> None:
             if session.laser:
-                session.know(sweep.init)
+                session.send_scanner(sweep.init)
                 session.outbox.set("scan", (frame,), now)
 
         return send
@@ -212,13 +201,13 @@ class AlfHq(HqSide):
         a, b, c = (self._measured(value / self._acceleration) for value in (x, 0.0 - y, z))
         d, e, f = (self._measured(value / self._gyro) for value in turning)
         speed = round(min(1.0, abs(_finite(motion.speed or 0.0))) * FULL_INFO)
-        message = DriveInfo(speed, a, b, c, d, e, f, _finite(motion.temperature or 0.0))
+        message = messages.DriveInfo(speed, a, b, c, d, e, f, _finite(motion.temperature or 0.0))
         frame = self._write(message)
         return lambda session, now: session.outbox.set("info", (frame,), now) if session.drive else None
 
     def _measured(self, value: float) -> float:
         value = _finite(value)
-        return value if self._dialect is Dialect.TEXT else round(max(-_RAW_16, min(_RAW_16, value)))
+        return value if self._dialect is messages.AlfDialect.TEXT else round(max(-_RAW_16, min(_RAW_16, value)))
 
     # What is understood
 
@@ -226,15 +215,15 @@ class AlfHq(HqSide):
         """A turn without speed only sets the wheels, and so is neutral."""
         return command.moving and not (isinstance(command, Drive) and not command.forward and not command.left)
 
-    def take(self, session: HqClient, message: AlfMessage) -> tuple[Telemetry, ...]:
-        if not isinstance(message, DriveCommand):
+    def take(self, session: AlfClient, message: messages.AlfMessage) -> tuple[Telemetry, ...]:
+        if not isinstance(message, messages.DriveCommand):
             raise ProtocolError(f"{message.spec.name} from an HQ program")
         if not self._drive:
             session.left_out["drive command"] += 1
             return ()
         if self._auto and not session.drive:  # no deployed program can read both kinds ("The gateway as vehicle")
             session.show_drive()
-        straight = FULL_LOCK_DEG if self._dialect is Dialect.BINARY else 0
+        straight = FULL_LOCK_DEG if self._dialect is messages.AlfDialect.BINARY else 0
         right = max(-1.0, min(1.0, (message.steering - straight) / FULL_LOCK_DEG))
         speed = min(1.0, message.speed / self._full_speed)
         if not speed and self.view.protocol != NAME:  # it only sets wheels; other robots would turn on the spot

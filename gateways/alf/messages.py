@@ -1,7 +1,7 @@
 """The five messages of ALF, each declared once for both dialects, and their framing.
 
 Source: the message table, "Dialect `binary`" and "Dialect `text`" of the protocol page. A field's type is its
-binary form; a comment tells where the text form is a different number. Sans-IO.
+binary form; a comment marks a field whose text form differs. Sans-IO.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ _MOST_MEASURED = 1e9
 POINT_BYTES = 8
 
 
-class Dialect(Enum):
+class AlfDialect(Enum):
     """The packed fields of the document, or the ASCII of deployed programs."""
 
     BINARY = "binary"
     TEXT = "text"
 
 
-class Sender(Enum):
+class AlfSender(Enum):
     """Who sends a message."""
 
     VEHICLE = "vehicle"
@@ -57,7 +57,7 @@ class Sender(Enum):
 class AlfMessage(Message, frozen=True):
     """A message of this protocol."""
 
-    spec: ClassVar[Spec]
+    spec: ClassVar[AlfSpec]
 
 
 A = TypeVar("A", bound=AlfMessage)
@@ -71,26 +71,26 @@ Steering = Annotated[int, Scalar("B"), Whole(-90, 90)]
 """Binary: 0 full left, 90 straight, 180 full right. Text: -90 full left, 90 full right."""
 
 
-class Spec(msgspec.Struct, frozen=True, eq=False):
+class AlfSpec(msgspec.Struct, frozen=True, eq=False):
     """A row of the message table."""
 
     id: int
     name: str
-    sender: Sender
+    sender: AlfSender
     message: type[AlfMessage]
     binary: BinaryCodec[AlfMessage]
     text: TextCodec[AlfMessage]
 
 
-MESSAGES: dict[int, Spec] = {}
+MESSAGES: dict[int, AlfSpec] = {}
 """The message table, by id."""
 
 
-def message(message_id: int, name: str, sender: Sender) -> Callable[[type[A]], type[A]]:
+def message(message_id: int, name: str, sender: AlfSender) -> Callable[[type[A]], type[A]]:
     """Enter a declaration into the message table."""
 
     def enter(declared: type[A]) -> type[A]:
-        declared.spec = MESSAGES[message_id] = Spec(
+        declared.spec = MESSAGES[message_id] = AlfSpec(
             message_id,
             name,
             sender,
@@ -103,7 +103,7 @@ def message(message_id: int, name: str, sender: Sender) -> Callable[[type[A]], t
     return enter
 
 
-@message(1, "measurement", Sender.VEHICLE)
+@message(1, "measurement", AlfSender.VEHICLE)
 class Measurement(AlfMessage, frozen=True, eq=False):
     """One sweep of the scanner. points: int64[n], mm; the valid indices are inclusive."""
 
@@ -114,7 +114,7 @@ class Measurement(AlfMessage, frozen=True, eq=False):
     last_valid: U32
 
 
-@message(2, "scanner init", Sender.VEHICLE)
+@message(2, "scanner init", AlfSender.VEHICLE)
 class ScannerInit(AlfMessage, frozen=True):
     """The geometry of the scanner: degrees, ms, mm."""
 
@@ -131,7 +131,7 @@ class ScannerInit(AlfMessage, frozen=True):
             raise ProtocolError(f"scanner init with angles {angles}")
 
 
-@message(3, "drive command", Sender.HQ)
+@message(3, "drive command", AlfSender.HQ)
 class DriveCommand(AlfMessage, frozen=True):
     """How the vehicle shall move. ``direction``: 0 forward, 1 backward."""
 
@@ -141,7 +141,7 @@ class DriveCommand(AlfMessage, frozen=True):
     light: Bool
 
 
-@message(4, "drive info", Sender.VEHICLE)
+@message(4, "drive info", AlfSender.VEHICLE)
 class DriveInfo(AlfMessage, frozen=True):
     """How the vehicle moves. Accelerations: ``lateral`` to the right, ``vertical`` towards the ground."""
 
@@ -160,7 +160,7 @@ class DriveInfo(AlfMessage, frozen=True):
             raise ProtocolError(f"drive info with {values} and temperature {self.temperature:g}")
 
 
-@message(255, "end", Sender.BOTH)
+@message(255, "end", AlfSender.BOTH)
 class End(AlfMessage, frozen=True):
     """The end of the conversation: both sides close."""
 
@@ -171,9 +171,9 @@ class End(AlfMessage, frozen=True):
             raise ProtocolError(f"end with {self.always_1}, expected 1")
 
 
-def sent_by(sender: Sender) -> frozenset[int]:
+def sent_by(sender: AlfSender) -> frozenset[int]:
     """List the ids that one side sends."""
-    return frozenset(spec.id for spec in MESSAGES.values() if spec.sender in (sender, Sender.BOTH))
+    return frozenset(spec.id for spec in MESSAGES.values() if spec.sender in (sender, AlfSender.BOTH))
 
 
 # Text
@@ -219,7 +219,7 @@ def write_text(message: AlfMessage) -> bytes:
     return b"%d|%b;" % (spec.id, spec.text.encode(message))
 
 
-def _known(number: bytes, ids: frozenset[int]) -> Spec:
+def _known(number: bytes, ids: frozenset[int]) -> AlfSpec:
     shown = number[:_FIELD_BYTES].decode()
     if not number.isdigit() or len(number) > 3 or int(number) not in ids:
         raise ProtocolError(f"message id {shown}, expected one of {sorted(ids)}")
@@ -236,7 +236,7 @@ def binary_size(message_id: int, points: int) -> int:
 
 
 def binary_frame_end(ids: frozenset[int], points: Callable[[], int]) -> FrameEnd:
-    """Make the framing function of the binary dialect: the id tells the length; ``points()``, that of a measurement.
+    """Make the framing function of the binary dialect: the id sets the length, ``points()`` that of a measurement.
 
     Bytes that begin no message make a frame of their own, up to the next byte that might.
     """
@@ -272,7 +272,7 @@ _SKIPPED = 4096
 def codecs() -> tuple[Codec, ...]:
     """List the messages of both dialects and both sides for the conformance kit; one measurement has two points."""
     found = []
-    for sender, whole in ((Sender.VEHICLE, (DriveInfo(1, 2, 3, 4, 5, 6, 7, 0.5),)), (Sender.HQ, ())):
+    for sender, whole in ((AlfSender.VEHICLE, (DriveInfo(1, 2, 3, 4, 5, 6, 7, 0.5),)), (AlfSender.HQ, ())):
         ids = sent_by(sender)
         messages = (*(MESSAGES[number].message for number in sorted(ids - {DriveInfo.spec.id})), *whole)
         end = binary_frame_end(ids, lambda: 2)

@@ -10,26 +10,7 @@ from typing import Any, ClassVar
 
 import msgspec
 
-from gateways.alf.messages import (
-    MOST_POINTS,
-    POINTS,
-    AlfMessage,
-    Dialect,
-    DriveCommand,
-    End,
-    Measurement,
-    ScannerInit,
-    Sender,
-    binary_frame_end,
-    binary_size,
-    read_binary,
-    read_text,
-    sent_by,
-    text_frame_end,
-    text_limit,
-    write_binary,
-    write_text,
-)
+from gateways.alf import messages
 from zbridge.protocol import Code, Limits, NotReady, ProtocolError, Role, Session, State
 
 REPEAT_S = 0.02
@@ -40,21 +21,21 @@ _DRIVE = "drive"
 _BOUNDS = Limits(frame_bytes=0, handshake_s=HANDSHAKE_S)
 
 
-class AlfSession(Session[AlfMessage]):
+class AlfSession(Session[messages.AlfMessage]):
     """Both roles. ``points``: points of a measurement; the binary framing depends on it.
 
     ``bounds``: what a listener demands of its clients.
     """
 
     kept: ClassVar[dict[str, Any]] = {"points": int, "_broken": bool}
-    handled = frozenset({End})
+    handled = frozenset({messages.End})
     _SENT_BY_PEER: frozenset[int]
 
     def __init__(
         self,
-        dialect: Dialect,
+        dialect: messages.AlfDialect,
         *,
-        points: int = POINTS,
+        points: int = messages.POINTS,
         points_from_scanner: bool = False,
         gap_s: float = 0.0,
         bounds: Limits = _BOUNDS,
@@ -64,41 +45,41 @@ class AlfSession(Session[AlfMessage]):
         self._ids = self._SENT_BY_PEER
         self._broken = False
         self._points_from_scanner = points_from_scanner
-        if dialect is Dialect.TEXT:
-            limit = text_limit(MOST_POINTS if points_from_scanner else max(points, POINTS))
-            self.frame_end = text_frame_end(limit)
-            self._read, self._write = read_text, write_text
+        if dialect is messages.AlfDialect.TEXT:
+            limit = messages.text_limit(messages.MOST_POINTS if points_from_scanner else max(points, messages.POINTS))
+            self.frame_end = messages.text_frame_end(limit)
+            self._read, self._write = messages.read_text, messages.write_text
         else:
-            limit = binary_size(Measurement.spec.id, MOST_POINTS)
-            self.frame_end = binary_frame_end(self._ids, lambda: self.points)
-            self._read, self._write = read_binary, write_binary
+            limit = messages.binary_size(messages.Measurement.spec.id, messages.MOST_POINTS)
+            self.frame_end = messages.binary_frame_end(self._ids, lambda: self.points)
+            self._read, self._write = messages.read_binary, messages.write_binary
         super().__init__(msgspec.structs.replace(bounds, frame_bytes=limit, gap_s=gap_s))
 
-    def send(self, message: AlfMessage) -> None:
+    def send(self, message: messages.AlfMessage) -> None:
         if self.over:
             raise NotReady("closing", Code.CLOSING)
         super().send(message)
 
-    def encode(self, message: AlfMessage) -> bytes:
+    def encode(self, message: messages.AlfMessage) -> bytes:
         return self._write(message)
 
-    def decode(self, frame: bytes) -> AlfMessage:
-        if self.dialect is Dialect.TEXT:
+    def decode(self, frame: bytes) -> messages.AlfMessage:
+        if self.dialect is messages.AlfDialect.TEXT:
             broken, self._broken = self._broken, not frame.endswith(b";")
             if broken:  # these bytes are the rest of a message that was too long
                 raise ProtocolError(f"{len(frame)} bytes more of a message without an end")
         message = self._read(frame, self._ids)
-        if isinstance(message, ScannerInit) and self._points_from_scanner:
+        if isinstance(message, messages.ScannerInit) and self._points_from_scanner:
             self.points = points_of(message)
-        if isinstance(message, Measurement) and len(message.points) != self.points:
+        if isinstance(message, messages.Measurement) and len(message.points) != self.points:
             raise ProtocolError(f"measurement of {len(message.points)} points, expected {self.points}")
         return message
 
     def opened(self, now: float) -> None:
         self.establish("", ())
 
-    def accept(self, message: AlfMessage, now: float) -> bool:
-        if isinstance(message, End):
+    def accept(self, message: messages.AlfMessage, now: float) -> bool:
+        if isinstance(message, messages.End):
             self.close(ENDED, now)
             return False
         return True
@@ -107,24 +88,24 @@ class AlfSession(Session[AlfMessage]):
         """Send END once; nothing follows it."""
         if self.state is State.ESTABLISHED:
             self.outbox.clear(_DRIVE)
-            super().send(End())
+            super().send(messages.End())
         super().close(reason, now)
 
 
-class HqRole(AlfSession):
+class AlfHqRole(AlfSession):
     """We play HQ towards a vehicle. ``drives``: the first command of a link that drives; it repeats from the start."""
 
     role = Role.HQ
-    _SENT_BY_PEER = sent_by(Sender.VEHICLE)
+    _SENT_BY_PEER = messages.sent_by(messages.AlfSender.VEHICLE)
 
     def __init__(
         self,
-        dialect: Dialect,
+        dialect: messages.AlfDialect,
         *,
-        points: int = POINTS,
+        points: int = messages.POINTS,
         points_from_scanner: bool = False,
         gap_s: float = 0.0,
-        drives: DriveCommand | None = None,
+        drives: messages.DriveCommand | None = None,
     ) -> None:
         super().__init__(dialect, points=points, points_from_scanner=points_from_scanner, gap_s=gap_s)
         self._at_first = drives
@@ -134,7 +115,7 @@ class HqRole(AlfSession):
         if self._at_first is not None:
             self.drive(self._at_first, now)
 
-    def drive(self, command: DriveCommand, now: float, *, urgent: bool = False) -> None:
+    def drive(self, command: messages.DriveCommand, now: float, *, urgent: bool = False) -> None:
         """Send a command at once, and again every 20 ms until the next one."""
         if self.over:
             raise NotReady("closing", Code.CLOSING)
@@ -145,12 +126,12 @@ class VehicleRole(AlfSession):
     """We play the vehicle towards an HQ."""
 
     role = Role.ROBOT
-    _SENT_BY_PEER = sent_by(Sender.HQ)
+    _SENT_BY_PEER = messages.sent_by(messages.AlfSender.HQ)
 
 
-def points_of(scanner: ScannerInit) -> int:
+def points_of(scanner: messages.ScannerInit) -> int:
     """Compute the number of points from a scanner's geometry; raise ProtocolError if the number is absurd."""
     points = (scanner.angle_max_deg - scanner.angle_min_deg) / scanner.angle_increment_deg + 1
-    if not 0.5 <= points <= MOST_POINTS:
-        raise ProtocolError(f"scanner init with {points:g} points, expected 1 to {MOST_POINTS}")
+    if not 0.5 <= points <= messages.MOST_POINTS:
+        raise ProtocolError(f"scanner init with {points:g} points, expected 1 to {messages.MOST_POINTS}")
     return round(points)

@@ -12,7 +12,7 @@ import random
 
 import numpy as np
 
-from gateways.alf.messages import AlfMessage, Dialect, DriveCommand, DriveInfo, Measurement, ScannerInit
+from gateways.alf.messages import AlfDialect, AlfMessage, DriveCommand, DriveInfo, Measurement, ScannerInit
 from gateways.alf.session import VehicleRole
 from gateways.alf.translate import DRIVE, LASER, VEHICLE
 from zbridge.protocol import Simulation
@@ -44,7 +44,7 @@ _MOST_SPEED, _MOST_TEXT_SPEED = 100, 255
 class Car:
     """The vehicle itself: what commands make it do, and what it measures. Knows no connection."""
 
-    def __init__(self, seed: int, dialect: Dialect) -> None:
+    def __init__(self, seed: int, dialect: AlfDialect) -> None:
         rng = random.Random(seed)
         self.body = Body.somewhere(rng, radius=0.25)
         self.light = False
@@ -64,9 +64,9 @@ class Car:
 
     def take(self, command: DriveCommand) -> None:
         """Obey a drive command."""
-        straight = _FULL_LOCK_DEG if self._dialect is Dialect.BINARY else 0
+        straight = _FULL_LOCK_DEG if self._dialect is AlfDialect.BINARY else 0
         right_deg = max(-_FULL_LOCK_DEG, min(_FULL_LOCK_DEG, command.steering - straight))
-        most = _MOST_SPEED if self._dialect is Dialect.BINARY else _MOST_TEXT_SPEED
+        most = _MOST_SPEED if self._dialect is AlfDialect.BINARY else _MOST_TEXT_SPEED
         speed = min(most, command.speed) / _MOST_SPEED * SPEED_M_S
         self._wanted_m_s = -speed if command.direction else speed
         self._wheels_rad = -right_deg / _FULL_LOCK_DEG * LOCK_RAD
@@ -101,7 +101,7 @@ class Car:
         g, degrees = STANDARD_GRAVITY, math.degrees(self._turn_rad_s)
         lateral = -self.speed_m_s * self._turn_rad_s / g
         values = (self._acceleration / g, lateral, 1.0, 0.0, 0.0, degrees)
-        if self._dialect is Dialect.BINARY:
+        if self._dialect is AlfDialect.BINARY:
             values = tuple(round(value * (1000 if place < 3 else 10)) for place, value in enumerate(values))  # type: ignore[assignment]
         return DriveInfo(round(abs(self.speed_m_s) / SPEED_M_S * _MOST_SPEED), *values, TEMPERATURE)
 
@@ -109,7 +109,7 @@ class Car:
 class VehicleSimulator(Simulator[AlfMessage]):
     """Serves one car: on one link, or drive commands on the first and measurements on the second ("Roles")."""
 
-    def __init__(self, seed: int, dialect: Dialect, links: int) -> None:
+    def __init__(self, seed: int, dialect: AlfDialect, links: int) -> None:
         super().__init__(log, links=(DRIVE, LASER) if links > 1 else (VEHICLE,))
         self.car = Car(seed, dialect)
         self._dialect = dialect
@@ -142,5 +142,5 @@ class VehicleSimulator(Simulator[AlfMessage]):
 
 async def simulate(simulation: Simulation) -> None:
     """Run a simulated vehicle until cancelled."""
-    dialect = Dialect(simulation.dialect or "text")
+    dialect = AlfDialect(simulation.dialect or "text")
     await VehicleSimulator(simulation.seed, dialect, len(simulation.addresses)).run(simulation)

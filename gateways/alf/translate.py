@@ -14,17 +14,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from gateways.alf.messages import (
-    MOST_POINTS,
-    POINTS,
-    AlfMessage,
-    Dialect,
-    DriveCommand,
-    DriveInfo,
-    Measurement,
-    ScannerInit,
-)
-from gateways.alf.session import HqRole, points_of
+from gateways.alf import messages
+from gateways.alf.session import AlfHqRole, points_of
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Floats, Motion, Scan, Scanner, Switch
 from zbridge.fleet.topics import Topic
@@ -55,20 +46,20 @@ _MOST_TABLE_MM = 100_000
 _FORWARD, _BACKWARD = 0, 1
 _COUNTER_ENDS = 2**32
 UNITS = {
-    Dialect.TEXT: (STANDARD_GRAVITY, math.radians(1.0)),
-    Dialect.BINARY: (STANDARD_GRAVITY / 1000, math.radians(0.1)),
+    messages.AlfDialect.TEXT: (STANDARD_GRAVITY, math.radians(1.0)),
+    messages.AlfDialect.BINARY: (STANDARD_GRAVITY / 1000, math.radians(0.1)),
 }
-"""One unit of acceleration (m/s2) and of gyro (rad/s), unless the options tell another."""
+"""One unit of acceleration (m/s2) and of gyro (rad/s), unless the options set another."""
 
 Ints = npt.NDArray[np.int64]
 Scale = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
 
 
-class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class AlfOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[device.options]``; the template of ``zbridge init`` explains each."""
 
     dialect: Literal["text", "binary"] = "text"
-    points: Annotated[int, msgspec.Meta(ge=1, le=MOST_POINTS)] = POINTS
+    points: Annotated[int, msgspec.Meta(ge=1, le=messages.MOST_POINTS)] = messages.POINTS
     points_from_scanner: bool = False
     speed_full: Annotated[int, msgspec.Meta(ge=1, le=255)] = 100
     acceleration_m_s2: Scale | None = None
@@ -81,26 +72,26 @@ class AlfRobot(Robot):
 
     hands_over = True
     kept: ClassVar[dict[str, Any]] = {
-        "_scanner": ScannerInit | None,
+        "_scanner": messages.ScannerInit | None,
         "_clock": DeviceClock,
         "_sequence": int | None,
         "_light": bool,
         "_backward": bool,
-        "_command": DriveCommand,
+        "_command": messages.DriveCommand,
     }
 
-    def __init__(self, options: Options, links: int = 1, metrics: Metrics | None = None) -> None:
+    def __init__(self, options: AlfOptions, links: int = 1, metrics: Metrics | None = None) -> None:
         metrics = metrics or Metrics()
         self.options = options
         self.link_names = (VEHICLE,) if links == 1 else (DRIVE, LASER)
         self.dialect = options.dialect  # type: ignore[misc]
-        self._dialect = Dialect(options.dialect)
-        self._session: HqRole | None = None
+        self._dialect = messages.AlfDialect(options.dialect)
+        self._session: AlfHqRole | None = None
         acceleration, gyro = UNITS[self._dialect]
         self._acceleration = options.acceleration_m_s2 or acceleration
         self._gyro = options.gyro_rad_s or gyro
-        self._scanner: ScannerInit | None = None
-        self._clock = DeviceClock(_COUNTER_ENDS if self._dialect is Dialect.BINARY else None)
+        self._scanner: messages.ScannerInit | None = None
+        self._clock = DeviceClock(_COUNTER_ENDS if self._dialect is messages.AlfDialect.BINARY else None)
         self._sequence: int | None = None
         self._gaps = metrics.count("sequence_gaps")
         self._duplicates = metrics.count("sequence_duplicates")
@@ -109,15 +100,15 @@ class AlfRobot(Robot):
         self._command = self._neutral()
 
     @property
-    def driving(self) -> HqRole | None:
+    def driving(self) -> AlfHqRole | None:
         return self._session
 
-    def session(self, link: str, peer: str) -> HqRole:
+    def session(self, link: str, peer: str) -> AlfHqRole:
         drives = link == self.link_names[0]
         if drives:
             self._backward = False
             self._command = self._neutral()
-        session = HqRole(
+        session = AlfHqRole(
             self._dialect,
             points=self.options.points,
             points_from_scanner=self.options.points_from_scanner,
@@ -133,7 +124,7 @@ class AlfRobot(Robot):
     def translator(self, kind: type) -> Translate:
         return partial(_TELEMETRY[kind], self)
 
-    def _scan(self, message: Measurement, stamp_ns: int) -> tuple[Telemetry, ...]:
+    def _scan(self, message: messages.Measurement, stamp_ns: int) -> tuple[Telemetry, ...]:
         scanner = self._scanner
         if scanner is None:
             raise ProtocolError("measurement before scanner init")
@@ -160,7 +151,7 @@ class AlfRobot(Robot):
         else:
             self._gaps.value += sequence - before - 1
 
-    def _geometry(self, message: ScannerInit, stamp_ns: int) -> tuple[Telemetry, ...]:
+    def _geometry(self, message: messages.ScannerInit, stamp_ns: int) -> tuple[Telemetry, ...]:
         points = points_of(message) if self.options.points_from_scanner else self.options.points
         self._scanner = message
         scanner = Scanner(
@@ -175,7 +166,7 @@ class AlfRobot(Robot):
         )
         return ((topics.SCANNER, scanner),)
 
-    def _motion(self, message: DriveInfo, stamp_ns: int) -> tuple[Telemetry, ...]:
+    def _motion(self, message: messages.DriveInfo, stamp_ns: int) -> tuple[Telemetry, ...]:
         speed = min(1.0, message.speed / self.options.speed_full)
         a, g = self._acceleration, self._gyro
         motion = Motion(
@@ -218,16 +209,16 @@ class AlfRobot(Robot):
         self._send(self._written(speed, backward=backward, steering_deg=steering_deg), now)
         return Outcome(left_out="left: an ALF vehicle steers, it does not move sideways" if command.left else None)
 
-    def _neutral(self) -> DriveCommand:
+    def _neutral(self) -> messages.DriveCommand:
         """Speed 0, wheels straight. The direction is kept: the vehicle may still roll."""
         return self._written(0, backward=self._backward, steering_deg=0)
 
-    def _written(self, speed: int, *, backward: bool, steering_deg: int) -> DriveCommand:
+    def _written(self, speed: int, *, backward: bool, steering_deg: int) -> messages.DriveCommand:
         """Make a command. ``steering_deg``: positive to the right."""
-        straight = FULL_LOCK_DEG if self._dialect is Dialect.BINARY else 0
-        return DriveCommand(speed, _BACKWARD if backward else _FORWARD, straight + steering_deg, self._light)
+        straight = FULL_LOCK_DEG if self._dialect is messages.AlfDialect.BINARY else 0
+        return messages.DriveCommand(speed, _BACKWARD if backward else _FORWARD, straight + steering_deg, self._light)
 
-    def _send(self, command: DriveCommand, now: float, *, urgent: bool = False) -> None:
+    def _send(self, command: messages.DriveCommand, now: float, *, urgent: bool = False) -> None:
         if self._session is None:
             raise NotReady("offline")
         self._session.drive(command, now, urgent=urgent)
@@ -235,7 +226,7 @@ class AlfRobot(Robot):
         self._backward = command.direction == _BACKWARD
 
 
-def ranges_m(message: Measurement, scanner: ScannerInit) -> Floats:
+def ranges_m(message: messages.Measurement, scanner: messages.ScannerInit) -> Floats:
     """Give the ranges, metres, float32[n]: NaN outside the valid indices (inclusive) and outside the range."""
     least, most = max(1, scanner.range_min_mm), max(0, scanner.range_max_mm)
     if most <= _MOST_TABLE_MM:
@@ -259,8 +250,8 @@ def _in_metres(points: Ints, least: int, most: int) -> Floats:
     return metres
 
 
-_TELEMETRY: dict[type[AlfMessage], Callable[[AlfRobot, Any, int], tuple[Telemetry, ...]]] = {
-    Measurement: AlfRobot._scan,
-    ScannerInit: AlfRobot._geometry,
-    DriveInfo: AlfRobot._motion,
+_TELEMETRY: dict[type[messages.AlfMessage], Callable[[AlfRobot, Any, int], tuple[Telemetry, ...]]] = {
+    messages.Measurement: AlfRobot._scan,
+    messages.ScannerInit: AlfRobot._geometry,
+    messages.DriveInfo: AlfRobot._motion,
 }

@@ -1,7 +1,8 @@
 """ROS 2 robots whose nodes use rmw_zenoh: read and driven over plain Zenoh, without ROS.
 
-``messages`` says what is heard; ``graph`` who publishes and who takes commands; ``session`` holds the conversation;
-``translate`` is the device side, ``settings`` its options. ``simulator`` is a simulated robot. HQ programs of other
+``messages`` declares the messages; ``graph`` knows who publishes and who subscribes to commands; ``session`` holds the
+conversation;
+``translate`` is the device side, ``options`` its options. ``simulator`` is a simulated robot. HQ programs of other
 protocols drive it; it has no HQ side of its own: what ROS users see is ``zbridge ros2``.
 """
 
@@ -9,7 +10,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from gateways.ros2.settings import Options
+from gateways.ros2.options import RosOptions
 from zbridge.protocol import (
     Codec,
     KeyedSample,
@@ -50,7 +51,7 @@ shared = false                          # true: another node (Nav2) drives it to
 """
 
 
-def _robot(options: Options, links: int, metrics: Metrics) -> Robot:
+def _robot(options: RosOptions, links: int, metrics: Metrics) -> Robot:
     from gateways.ros2.translate import RosRobot  # loads numpy
 
     return RosRobot(options, links, metrics)
@@ -66,7 +67,7 @@ SIMULATED: dict[str, Any] = {"speed_full_mps": 1.0, "turn_full_radps": 2.0}
 PROTOCOL = Protocol(
     name="ros2",
     summary="ROS 2 robots over rmw_zenoh, without ROS",
-    options=Options,
+    options=RosOptions,
     links=1,
     robot=_robot,
     simulate=_simulate,

@@ -1,44 +1,46 @@
-"""Who publishes a robot's topics and who takes its commands, as the liveliness tokens of ROS nodes tell. Sans-IO."""
+"""Who publishes a robot's topics and who subscribes to its commands, by the liveliness tokens of ROS nodes. Sans-IO."""
 
 from __future__ import annotations
 
 import msgspec
 
-from gateways.ros2.messages import HEARD, KEPT, TWIST, TWIST_STAMPED, Command, Heard
-from gateways.ros2.settings import Options
+from gateways.ros2.messages import RECEIVED, TRANSIENT_LOCAL, TWIST, TWIST_STAMPED, Received, TwistCommand
+from gateways.ros2.options import RosOptions
 from zbridge.protocol import ProtocolError
 from zbridge.ros2 import NO_HASH, Endpoint, Kind, Types, endpoints_of, read_token
 
 ENDPOINTS = 64
-"""Publishers of the robot, takers of its commands, and other drivers that are known, each; more are not looked at."""
+"""Most known publishers of the robot, subscribers to its commands, and other drivers, each; the rest is ignored."""
 
 
 class Wanted(msgspec.Struct, frozen=True):
-    """One topic that is read. kept: the last message from before is wanted too."""
+    """One topic that is read. latched: a late subscriber gets the last message."""
 
     name: str
-    heard: type[Heard]
+    received: type[Received]
     types: tuple[str, ...]
-    kept: bool
+    latched: bool
 
 
 class Graph:
     """The endpoints of one robot's topics."""
 
-    def __init__(self, options: Options, types: Types) -> None:
+    def __init__(self, options: RosOptions, types: Types) -> None:
         self._domain = options.domain
         self._types = types
         self.command_topic = options.topic("cmd_vel")
-        topics = ((option, options.topic(option)) for option in HEARD)
+        topics = ((option, options.topic(option)) for option in RECEIVED)
         self._wanted = {
-            name: Wanted(name, HEARD[option][0], (HEARD[option][1],), option in KEPT)
+            name: Wanted(name, RECEIVED[option][0], (RECEIVED[option][1],), option in TRANSIENT_LOCAL)
             for option, name in topics
             if name is not None
         }
-        self._command = Wanted(self.command_topic or "", Command, (TWIST, TWIST_STAMPED), kept=False)
+        self._command = Wanted(self.command_topic or "", TwistCommand, (TWIST, TWIST_STAMPED), latched=False)
+        self.own_zid: str | None = None
+        """The Zenoh id of our own node."""
         self.publishers: dict[str, Endpoint] = {}
         """By their tokens, as the next two."""
-        self.takers: dict[str, Endpoint] = {}
+        self.subscribers: dict[str, Endpoint] = {}
         self.drivers: dict[str, Endpoint] = {}
         """Other nodes that publish on the topic of commands."""
         self.wrong: dict[str, str] = {}
@@ -48,7 +50,9 @@ class Graph:
         """For each key that is read: what it is, and the type of its messages."""
 
     def __repr__(self) -> str:
-        return f"<Graph of {len(self.publishers)} publishers, {len(self.takers)} takers, {len(self.drivers)} drivers>"
+        return (
+            f"<Graph publishers={len(self.publishers)} subscribers={len(self.subscribers)} drivers={len(self.drivers)}>"
+        )
 
     def watched(self) -> list[str]:
         """List the expressions of the tokens that matter."""
@@ -80,14 +84,15 @@ class Graph:
         return endpoint
 
     def knows(self, token: str) -> bool:
-        """Tell whether a token is one of those that were looked at."""
-        return any(token in table for table in (self.publishers, self.takers, self.drivers, self.wrong))
+        """Return whether a token is our own, or was read before."""
+        tables = (self.publishers, self.subscribers, self.drivers, self.wrong)
+        return token.split("/", 3)[2:3] == [self.own_zid] or any(token in table for table in tables)
 
     def gone(self, token: str) -> bool:
         """Forget an endpoint; False if it was not known."""
         if self.wrong.pop(token, None) is not None:
             return True
-        for table in (self.publishers, self.takers, self.drivers):
+        for table in (self.publishers, self.subscribers, self.drivers):
             endpoint = table.pop(token, None)
             if endpoint is not None:
                 for gid in endpoint.gids():
@@ -100,6 +105,11 @@ class Graph:
         return self._wanted.get(name, self._command)
 
     @property
+    def features(self) -> tuple[str, ...]:
+        """The names of the topics that the robot publishes."""
+        return tuple(sorted({endpoint.name for endpoint in self.publishers.values()}))
+
+    @property
     def waiting_for(self) -> str:
         """Say why nothing of the robot is known."""
         if self.publishers:
@@ -109,9 +119,9 @@ class Graph:
         return f"nobody publishes {', '.join(self._wanted)}"
 
     @property
-    def idle_drive(self) -> str | None:
+    def drive_problem(self) -> str | None:
         """Say why the robot cannot be driven; None if it can."""
-        if self.takers:
+        if self.subscribers:
             return None
         if self.command_topic is None:
             return "cmd_vel is turned off"
@@ -121,7 +131,7 @@ class Graph:
     def _place(self, endpoint: Endpoint) -> tuple[dict[str, Endpoint], Wanted]:
         if endpoint.name == self.command_topic:
             if endpoint.kind is Kind.SUBSCRIBER:
-                return self.takers, self._command
+                return self.subscribers, self._command
             if endpoint.kind is Kind.PUBLISHER:
                 return self.drivers, self._command
         wanted = self._wanted.get(endpoint.name)

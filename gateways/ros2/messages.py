@@ -1,6 +1,6 @@
-"""What a session with a ROS 2 robot hears: a class for each topic, whose body is the ROS message. Sans-IO.
+"""The messages of a ROS 2 robot: those received, a class for each topic, and the velocities sent. Sans-IO.
 
-The bodies are those of rosbags: fields as in the ``.msg`` files, arrays as numpy arrays.
+The bodies of received messages are those of rosbags: fields as in the ``.msg`` files, arrays as numpy arrays.
 """
 
 from __future__ import annotations
@@ -10,18 +10,19 @@ from typing import Any
 import msgspec
 
 from zbridge.protocol import KeyedSample
+from zbridge.ros2 import Types
 
 TWIST, TWIST_STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 _NS_PER_S = 1_000_000_000
 
 
-class Event(msgspec.Struct, frozen=True):
-    """What the link tells about itself: it is open, a token appeared or is gone, samples were dropped."""
+class LinkEvent(msgspec.Struct, frozen=True):
+    """News of the link: it is open, a token appeared or is gone, samples were dropped."""
 
     sample: KeyedSample
 
 
-class Heard(msgspec.Struct, frozen=True):
+class Received(msgspec.Struct, frozen=True):
     """One message of a topic. body: of rosbags; ``stamp_ns`` of its header."""
 
     body: Any
@@ -33,31 +34,31 @@ class Heard(msgspec.Struct, frozen=True):
         return int(stamp.sec) * _NS_PER_S + int(stamp.nanosec)
 
 
-class LaserScan(Heard, frozen=True):
+class LaserScan(Received, frozen=True):
     """sensor_msgs/msg/LaserScan."""
 
 
-class Odometry(Heard, frozen=True):
+class Odometry(Received, frozen=True):
     """nav_msgs/msg/Odometry."""
 
 
-class OccupancyGrid(Heard, frozen=True):
+class OccupancyGrid(Received, frozen=True):
     """nav_msgs/msg/OccupancyGrid."""
 
 
-class Imu(Heard, frozen=True):
+class Imu(Received, frozen=True):
     """sensor_msgs/msg/Imu."""
 
 
-class BatteryState(Heard, frozen=True):
+class BatteryState(Received, frozen=True):
     """sensor_msgs/msg/BatteryState."""
 
 
-class CompressedImage(Heard, frozen=True):
+class CompressedImage(Received, frozen=True):
     """sensor_msgs/msg/CompressedImage."""
 
 
-class Command(Heard, frozen=True):
+class TwistCommand(Received, frozen=True):
     """What another node wrote to the topic of commands: geometry_msgs/msg/Twist or TwistStamped."""
 
 
@@ -65,7 +66,7 @@ class Ignored(msgspec.Struct, frozen=True):
     """A sample of our own that came back."""
 
 
-HEARD: dict[str, tuple[type[Heard], str]] = {
+RECEIVED: dict[str, tuple[type[Received], str]] = {
     "scan": (LaserScan, "sensor_msgs/msg/LaserScan"),
     "odom": (Odometry, "nav_msgs/msg/Odometry"),
     "map": (OccupancyGrid, "nav_msgs/msg/OccupancyGrid"),
@@ -74,7 +75,29 @@ HEARD: dict[str, tuple[type[Heard], str]] = {
     "image": (CompressedImage, "sensor_msgs/msg/CompressedImage"),
 }
 """For each option that names a topic: the class of its messages, and their type."""
-KEPT = frozenset({"map"})
-"""Topics whose last message comes to who is late."""
+TRANSIENT_LOCAL = frozenset({"map"})
+"""Topics with the durability of the name: a late subscriber gets the last message."""
 LIVE = (LaserScan, Odometry, Imu)
-"""Messages that are sent as soon as they are measured: their stamps tell the robot's clock."""
+"""Messages that robots send as soon as they measure: their stamps are the robot's clock."""
+
+
+class Velocity(msgspec.Struct, frozen=True):
+    """The content of a Twist: m/s forward and to the left, rad/s counter-clockwise."""
+
+    forward: float = 0.0
+    left: float = 0.0
+    turn: float = 0.0
+
+
+STOPPED = Velocity()
+
+
+def write_twist(types: Types, type_name: str, velocity: Velocity) -> bytes:
+    """Write a velocity as CDR of one of the two types; the stamp of a TwistStamped is zero."""
+    linear = types.message("geometry_msgs/msg/Vector3", x=velocity.forward, y=velocity.left)
+    angular = types.message("geometry_msgs/msg/Vector3", z=velocity.turn)
+    twist = types.message(TWIST, linear=linear, angular=angular)
+    if type_name == TWIST_STAMPED:
+        header = types.message("std_msgs/msg/Header", frame_id="base_link")
+        twist = types.message(TWIST_STAMPED, header=header, twist=twist)
+    return types.encode(twist)

@@ -2,11 +2,11 @@
 
 The link is a Zenoh session (:mod:`zbridge.protocol.samples`). The handshake: the link is open; a publisher of one of
 the robot's topics has a token; something came from it. The session ends when all tokens are gone or nothing came for
-``silent_s``; before it ends, the robot is told to stand still. ROS has no handshake of its own: ``busy`` says what is
-missing, and after :data:`HANDSHAKE_S` the link is opened anew.
+``silent_s``; before it ends, it sends the robot zeros. ROS has no handshake of its own: ``busy`` names what is missing,
+and after :data:`HANDSHAKE_S` the link is opened anew.
 
-What others write to the topic of commands is answered by what we said last, unless the robot is ``shared``: another
-node's motion must not outlive a stop.
+A command from another node is overruled by a repetition of our last one, unless the robot is ``shared``: another node's
+motion must not outlive a stop.
 """
 
 from __future__ import annotations
@@ -16,9 +16,8 @@ import struct
 from typing import Any
 
 from gateways.ros2.graph import Graph
-from gateways.ros2.messages import LIVE, TWIST_STAMPED, Command, Event, Ignored
-from gateways.ros2.settings import Options
-from gateways.ros2.twists import REST, Velocity, write_twist
+from gateways.ros2.messages import LIVE, STOPPED, TWIST_STAMPED, Ignored, LinkEvent, TwistCommand, Velocity, write_twist
+from gateways.ros2.options import RosOptions
 from zbridge.protocol import (
     SAMPLE_BYTES,
     Count,
@@ -40,15 +39,15 @@ from zbridge.protocol import (
 from zbridge.ros2 import KEEP_LAST_10, LATCHED, SENSOR_DATA, Attachment, Endpoint, Kind, Node, Types, read_attachment
 
 HANDSHAKE_S = 60.0
-"""Seconds after which the link is opened anew where nothing of the robot was heard."""
-LAST_S = 0.5
+"""Seconds after which the link is opened anew where nothing of the robot was received."""
+CLOSING_S = 0.5
 """Seconds for which zeros are repeated before a session ends."""
-REST_S = 1.0
+ZEROS_S = 1.0
 """Seconds for which zeros are repeated after neutral."""
 WATCH_S = 2.0
-"""Seconds between two questions for tokens, while something of the robot is missing."""
+"""Seconds between two queries for tokens, while something of the robot is missing."""
 ANSWERS_HZ = 100.0
-"""Times a second that other nodes' commands are answered."""
+"""Most times a second that other nodes' commands are overruled."""
 _DRIVE = "drive"
 _KIND_AT = 4
 """Offset of the kind in a frame."""
@@ -65,9 +64,9 @@ class RosRole(Session[Any]):
 
     role = Role.HQ
     frame_end = staticmethod(sample_end)
-    handled = frozenset({Event, Command, Ignored})
+    handled = frozenset({LinkEvent, TwistCommand, Ignored})
 
-    def __init__(self, options: Options, types: Types, overruled: Count) -> None:
+    def __init__(self, options: RosOptions, types: Types, overruled: Count) -> None:
         super().__init__(Limits(frame_bytes=SAMPLE_BYTES, handshake_s=HANDSHAKE_S))
         self.transport = "zenoh"
         self.outbox = _Dated(self)
@@ -84,8 +83,8 @@ class RosRole(Session[Any]):
         self._numbers: dict[str, int] = {}
         self._lost, self._lost_at = "", -math.inf
         """Why the session will end, and since when that is known."""
-        self._velocity = REST
-        self._now = self._heard_at = -math.inf
+        self._velocity = STOPPED
+        self._now = self._received_at = -math.inf
         self._time: tuple[int, float] = (0, 0.0)
         """Unix time of the last frame, and when it came on the session's own time line."""
         self._robot_time: tuple[int, float] | None = None
@@ -106,7 +105,7 @@ class RosRole(Session[Any]):
         sample = read_sample(frame)
         self._time = sample.stamp_ns, self._now
         if sample.kind is not SampleKind.SAMPLE:
-            return Event(sample)
+            return LinkEvent(sample)
         found = self.graph.keys.get(sample.key)
         if found is None:
             raise ProtocolError(f"{sample.key[:200]}: nothing of this robot")
@@ -114,30 +113,30 @@ class RosRole(Session[Any]):
         gid = read_attachment(sample.attachment).gid
         if gid == self._gids.get(sample.key):
             return Ignored()
-        if gid not in self.graph.gids and wanted.heard is not Command:  # robots obey whoever writes
+        if gid not in self.graph.gids and wanted.received is not TwistCommand:  # robots obey whoever writes
             raise ProtocolError(f"{wanted.name}: from no publisher that has a token")
-        message = wanted.heard(self._types.decode(type_name, sample.payload))
-        if wanted.heard is not Command:
-            self._heard_at = self._now
+        message = wanted.received(self._types.decode(type_name, sample.payload))
+        if wanted.received is not TwistCommand:
+            self._received_at = self._now
             if self._lost and self.graph.publishers:
                 self._lost = ""
-                self._look()
+                self._update_status()
             if isinstance(message, LIVE):
                 self._robot_time = message.stamp_ns, self._now
         return message
 
     def accept(self, message: Any, now: float) -> bool:
-        if isinstance(message, Event):
+        if isinstance(message, LinkEvent):
             self._on_event(message.sample)
             return False
-        if isinstance(message, Command):
-            self._answer(now)
+        if isinstance(message, TwistCommand):
+            self._overrule(now)
             return False
         if isinstance(message, Ignored):
             return False
         if self.state is State.HANDSHAKING:
-            self.establish("", self._features())
-            self._look()
+            self.establish("", self.graph.features)
+            self._update_status()
         return True
 
     # The link and the graph
@@ -152,22 +151,23 @@ class RosRole(Session[Any]):
             self._begin(sample.payload.decode("ascii", "replace"))
         elif sample.kind is SampleKind.OPENED:
             self._watch_again()
-        elif sample.kind is SampleKind.APPEARED and not self._is_own(sample.key) and not self.graph.knows(sample.key):
+        elif sample.kind is SampleKind.APPEARED and not self.graph.knows(sample.key):
             try:
                 self._appeared(self.graph.appeared(sample.key))
             finally:
-                self._look()
+                self._update_status()
         elif sample.kind is SampleKind.GONE and self.graph.gone(sample.key):
-            self._look()
+            self._update_status()
             if self.state is State.ESTABLISHED and not self.graph.publishers:
                 self._lose("its publishers are gone", self._now)
 
     def _begin(self, zid: str) -> None:
+        self.graph.own_zid = zid
         self._node = Node(self._options.domain, zid, 0, self._options.full_namespace, "zbridge")
         self.send_first(KeyedSample(SampleKind.ANNOUNCE, self._node.token()))
         for expression in self.graph.watched():
             self.send_first(KeyedSample(SampleKind.WATCH, expression))
-        self._look()
+        self._update_status()
 
     def _watch_again(self) -> None:
         """Ask for tokens again while something is missing: Zenoh may lose the news of some."""
@@ -176,38 +176,32 @@ class RosRole(Session[Any]):
             for expression in self.graph.watched():
                 self.send_first(KeyedSample(SampleKind.WATCH, expression))
 
-    def _is_own(self, token: str) -> bool:
-        return self._node is not None and token.split("/", 3)[2:3] == [self._node.zid]
-
     def _appeared(self, endpoint: Endpoint) -> None:
         """Read or write the key of a new endpoint, unless that is done already; show that by a token of our own."""
         wanted = self.graph.of_topic(endpoint.name)
         if endpoint.kind is Kind.SUBSCRIBER:
-            self._show(endpoint, Kind.PUBLISHER)
-        if wanted.heard is not Command or not self._options.shared:
-            self._show(endpoint, Kind.SUBSCRIBER, kept=wanted.kept)
-            self.send_first(subscription(endpoint.key, kept=wanted.kept))
+            self._announce_endpoint(endpoint, Kind.PUBLISHER)
+        if wanted.received is not TwistCommand or not self._options.shared:
+            self._announce_endpoint(endpoint, Kind.SUBSCRIBER, latched=wanted.latched)
+            self.send_first(subscription(endpoint.key, kept=wanted.latched))
 
-    def _show(self, endpoint: Endpoint, kind: Kind, *, kept: bool = False) -> None:
+    def _announce_endpoint(self, endpoint: Endpoint, kind: Kind, *, latched: bool = False) -> None:
         if (endpoint.key, kind) in self._own or self._node is None:
             return
         self._endpoints += 1
-        qos = KEEP_LAST_10 if kind is Kind.PUBLISHER else LATCHED if kept else SENSOR_DATA
+        qos = KEEP_LAST_10 if kind is Kind.PUBLISHER else LATCHED if latched else SENSOR_DATA
         own = Endpoint(self._node, self._endpoints, kind, endpoint.name, endpoint.type_name, endpoint.type_hash, qos)
         self._own[endpoint.key, kind] = own
         if kind is Kind.PUBLISHER:
             self._gids[endpoint.key] = own.gid()
         self.send_first(KeyedSample(SampleKind.ANNOUNCE, own.token()))
 
-    def _features(self) -> tuple[str, ...]:
-        return tuple(sorted({endpoint.name for endpoint in self.graph.publishers.values()}))
-
-    def _look(self) -> None:
-        """Say what is missing, and who else drives."""
+    def _update_status(self) -> None:
+        """Update ``busy`` (what is missing) and ``doubts`` (who else drives)."""
         if self.over:
             return
         if self.state is State.ESTABLISHED:
-            self.busy, self.features = self._lost or self.graph.idle_drive, self._features()
+            self.busy, self.features = self._lost or self.graph.drive_problem, self.graph.features
             nodes = sorted({driver.node.full_name[:_SHOWN] for driver in self.graph.drivers.values()})
             others = f"{', '.join(nodes[:3])} {'publish' if len(nodes) > 1 else 'publishes'} {self.graph.command_topic}"
             self.doubts = (f"{others} too, and is overruled",) if nodes and not self._options.shared else ()
@@ -219,7 +213,7 @@ class RosRole(Session[Any]):
     def timers(self) -> float:
         if self.state is not State.ESTABLISHED:
             return math.inf
-        return self._lost_at + LAST_S if self._lost else self._heard_at + self._options.silent_s
+        return self._lost_at + CLOSING_S if self._lost else self._received_at + self._options.silent_s
 
     def on_timer(self, now: float) -> None:
         if self._lost:
@@ -228,58 +222,63 @@ class RosRole(Session[Any]):
             self._lose(f"nothing came for {self._options.silent_s:g} s", now)
 
     def _lose(self, reason: str, now: float) -> None:
-        """Take no drives and repeat zeros; end after :data:`LAST_S`: one frame alone may be lost on the way."""
+        """Refuse drives and repeat zeros; end after :data:`CLOSING_S`: one frame alone may be lost on the way."""
         self._lost, self._lost_at = reason, now
-        if self.graph.takers and not (self._options.shared and not self.moving):
-            self.drive(REST, now, urgent=True)
-        self._look()
+        if self._must_stop:
+            self.drive(STOPPED, now, urgent=True)
+        self._update_status()
 
     def close(self, reason: str, now: float) -> None:
-        """Tell the robot to stand still, and end."""
-        if self.state is State.ESTABLISHED and self.graph.takers and not (self._options.shared and not self.moving):
-            self.drive(REST, now, until=now, urgent=True)
+        """Send zeros to the robot, and end."""
+        if self.state is State.ESTABLISHED and self._must_stop:
+            self.drive(STOPPED, now, until=now, urgent=True)
         super().close(reason, now)
+
+    @property
+    def _must_stop(self) -> bool:
+        """Whether zeros are due before the session ends: another node may be driving a ``shared`` robot."""
+        return bool(self.graph.subscribers) and (self.moving or not self._options.shared)
 
     # Commands
 
     @property
     def moving(self) -> bool:
-        """Whether the robot was told to move last."""
-        return self._velocity != REST
+        """Whether the last command was motion."""
+        return self._velocity != STOPPED
 
     def drive(self, velocity: Velocity, now: float, *, until: float | None = None, urgent: bool = False) -> None:
-        """Say how to move at once, then again at ``cmd_vel_hz``; zeros until ``until``, or for :data:`REST_S`.
+        """Send a velocity at once, then repeat it at ``cmd_vel_hz``; zeros until ``until``, or for :data:`ZEROS_S`.
 
-        Raises NotReady if nobody takes it, EncodeError.
+        Raises NotReady if nobody subscribes, EncodeError.
         """
         frames = self._commands(velocity)
         if not frames:
-            raise NotReady(self.graph.idle_drive or "nobody takes commands")
-        if velocity != REST:
+            raise NotReady(self.graph.drive_problem or "nobody takes commands")
+        if velocity != STOPPED:
             until = math.inf
         elif until is None:
-            until = now + REST_S
+            until = now + ZEROS_S
         self._velocity = velocity
         period_s = 1.0 / self._options.cmd_vel_hz
         self.outbox.set(_DRIVE, frames, now, period_s=period_s, until=until, urgent=urgent)
 
     def _commands(self, velocity: Velocity) -> tuple[bytes, ...]:
-        """Write a velocity for each type that is taken; :class:`_Dated` completes the frames when they leave."""
-        keys = {taker.key: taker.type_name for taker in self.graph.takers.values()}
+        """Write a velocity for each subscribed type; :class:`_Dated` completes the frames when they leave."""
+        keys = {subscriber.key: subscriber.type_name for subscriber in self.graph.subscribers.values()}
         return tuple(
             write_sample(KeyedSample(SampleKind.PUT, key, write_twist(self._types, type_name, velocity)))
             for key, type_name in keys.items()
         )
 
-    def _answer(self, now: float) -> None:
-        """Say again what we said last: another node has said something else."""
+    def _overrule(self, now: float) -> None:
+        """Repeat our last command: another node has sent one."""
         if self.state is not State.ESTABLISHED or self._options.shared or not self._answers.take(now):
             return
         self._overruled.value += 1
         until = None if self.moving else now
         if self.outbox.is_set(_DRIVE):  # zeros of a stop are not cut short
             until = None
-        if self.graph.takers:
+        if self.graph.subscribers:
             self.drive(self._velocity, now, until=until, urgent=not self.moving)
 
     def dated(self, frame: bytes, now: float) -> bytes:
@@ -290,7 +289,7 @@ class RosRole(Session[Any]):
         gid = self._gids[sample.key]
         number = self._numbers[sample.key] = self._numbers.get(sample.key, 0) + 1
         sent_ns = self._time[0] + round((now - self._time[1]) * _NS_PER_S)
-        payload = self._stamped(sample, self._robot_stamp(now))
+        payload = self._stamped(sample, _robot_stamp(self._robot_time, now))
         attachment = Attachment(number, max(0, sent_ns), gid).encode()
         return write_sample(KeyedSample(SampleKind.PUT, sample.key, payload, attachment))
 
@@ -309,13 +308,14 @@ class RosRole(Session[Any]):
     def overdue(self) -> str:
         return self.graph.waiting_for
 
-    def _robot_stamp(self, now: float) -> bytes:
-        """Write the time on the robot's clock, be it simulated or wrong: controllers drop what is old there."""
-        if self._robot_time is None:
-            return _STAMP.pack(0, 0)
-        stamp_ns, heard_at = self._robot_time
-        seconds, ns = divmod(stamp_ns + round((now - heard_at) * _NS_PER_S), _NS_PER_S)
-        return _STAMP.pack(seconds, ns) if 0 <= seconds < 2**31 else _STAMP.pack(0, 0)
+
+def _robot_stamp(robot_time: tuple[int, float] | None, now: float) -> bytes:
+    """Write the time on the robot's clock, be it simulated or wrong: controllers drop what is old there."""
+    if robot_time is None:
+        return _STAMP.pack(0, 0)
+    stamp_ns, received_at = robot_time
+    seconds, ns = divmod(stamp_ns + round((now - received_at) * _NS_PER_S), _NS_PER_S)
+    return _STAMP.pack(seconds, ns) if 0 <= seconds < 2**31 else _STAMP.pack(0, 0)
 
 
 class _Dated(Outbox):

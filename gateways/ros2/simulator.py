@@ -1,7 +1,7 @@
 """A simulated ROS 2 robot: two wheels, a lidar, an IMU, a battery and a map it makes, and ROS's router beside it.
 
-Its node does on Zenoh what nodes with rmw_zenoh do. Deterministic with a seed. Like ROS's own controllers it stands
-still when no command came for :data:`TIMEOUT_S`.
+Its node does on Zenoh what nodes with rmw_zenoh do. Deterministic with a seed. Like ROS's own controllers it stops
+when no command came for :data:`TIMEOUT_S`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from gateways.ros2.messages import TWIST, TWIST_STAMPED, Event
+from gateways.ros2.messages import TWIST, TWIST_STAMPED, LinkEvent
 from zbridge.protocol import (
     SAMPLE_BYTES,
     Address,
@@ -79,7 +79,7 @@ class NodeRole(Session[Any]):
 
     role = Role.ROBOT
     frame_end = staticmethod(sample_end)
-    handled = frozenset({Event})
+    handled = frozenset({LinkEvent})
 
     def __init__(self, types: Types, command_type: str, *, domain: int = 0, namespace: str = "/") -> None:
         super().__init__(Limits(frame_bytes=SAMPLE_BYTES, handshake_s=5.0))
@@ -94,13 +94,13 @@ class NodeRole(Session[Any]):
     def decode(self, frame: bytes) -> Any:
         sample = read_sample(frame)
         if sample.kind is not SampleKind.SAMPLE:
-            return Event(sample)
+            return LinkEvent(sample)
         read_attachment(sample.attachment)
         command = self._types.decode(self._command_type, sample.payload)
         return command.twist if self._command_type == TWIST_STAMPED else command
 
     def accept(self, message: Any, now: float) -> bool:
-        if isinstance(message, Event) and message.sample.kind is SampleKind.OPENED and not self._publishers:
+        if isinstance(message, LinkEvent) and message.sample.kind is SampleKind.OPENED and not self._publishers:
             self._begin(message.sample.payload.decode())
             self.establish(self._types.distro, ())
         return False
@@ -108,15 +108,19 @@ class NodeRole(Session[Any]):
     def _begin(self, zid: str) -> None:
         node = Node(self._domain, zid, 0, self._namespace, "robot")
         prefix, types = self._namespace.rstrip("/"), self._types
-        taker = Endpoint(
+        subscriber = Endpoint(
             node, 1, Kind.SUBSCRIBER, f"{prefix}/cmd_vel", self._command_type, types.hash(self._command_type)
         )
         for number, (name, (type_name, qos)) in enumerate(_TOPICS.items(), 2):
             self._publishers[name] = Endpoint(
                 node, number, Kind.PUBLISHER, f"{prefix}/{name}", type_name, types.hash(type_name), qos
             )
-        self.send_first(subscription(taker.key))
-        for token in (node.token(), taker.token(), *(publisher.token() for publisher in self._publishers.values())):
+        self.send_first(subscription(subscriber.key))
+        for token in (
+            node.token(),
+            subscriber.token(),
+            *(publisher.token() for publisher in self._publishers.values()),
+        ):
             self.send_first(KeyedSample(SampleKind.ANNOUNCE, token))
 
     def publish(self, name: str, message: Any) -> None:
@@ -130,7 +134,7 @@ class NodeRole(Session[Any]):
         self.send(KeyedSample(kind, publisher.key, self._types.encode(message), attachment))
 
 
-class Machine:
+class RosMachine:
     """The robot itself: what commands make it do, and what it measures. Knows no Zenoh."""
 
     def __init__(self, seed: int, types: Types) -> None:
@@ -141,7 +145,7 @@ class Machine:
         self._lived_s = self._commanded_s = 0.0
 
     def __repr__(self) -> str:
-        return f"<Machine {self.body} {self.forward:+.2f} m/s {self.turn:+.2f} rad/s>"
+        return f"<RosMachine {self.body} {self.forward:+.2f} m/s {self.turn:+.2f} rad/s>"
 
     def take(self, twist: Any) -> None:
         """Obey one command."""
@@ -237,11 +241,11 @@ class Machine:
 
 
 _SENT = {
-    "scan": (Machine.scan, "laser", _SCAN_EVERY),
-    "odom": (Machine.odometry, "odom", _ODOM_EVERY),
-    "imu": (Machine.imu, "base_link", _IMU_EVERY),
-    "battery_state": (Machine.battery, "base_link", _SLOW_EVERY),
-    "map": (Machine.map, "map", _SLOW_EVERY),
+    "scan": (RosMachine.scan, "laser", _SCAN_EVERY),
+    "odom": (RosMachine.odometry, "odom", _ODOM_EVERY),
+    "imu": (RosMachine.imu, "base_link", _IMU_EVERY),
+    "battery_state": (RosMachine.battery, "base_link", _SLOW_EVERY),
+    "map": (RosMachine.map, "map", _SLOW_EVERY),
 }
 """For each topic: what is measured, in which frame, and after how many steps."""
 
@@ -257,7 +261,7 @@ async def simulate(simulation: Simulation) -> None:
         raise ConfigError("a ROS 2 robot has one router")
     address = _with_port(simulation.addresses[0])
     types = types_of(distro)
-    machine, session = Machine(simulation.seed, types), NodeRole(types, _DIALECTS[dialect])
+    machine, session = RosMachine(simulation.seed, types), NodeRole(types, _DIALECTS[dialect])
 
     def deliver(twists: list[Any]) -> None:
         for twist in twists:
@@ -273,14 +277,14 @@ async def simulate(simulation: Simulation) -> None:
 
 
 def _with_port(address: Address) -> Address:
-    """Find a free port where none is told: Zenoh does not say which one it takes."""
+    """Find a free port where none is set: Zenoh does not report the one it binds."""
     if address.port:
         return address
     with socket.create_server((address.host, 0)) as free:
         return Address(address.host, int(free.getsockname()[1]))
 
 
-async def _live(machine: Machine, session: NodeRole, conversation: Conversation, types: Types) -> None:
+async def _live(machine: RosMachine, session: NodeRole, conversation: Conversation, types: Types) -> None:
     ticker, steps = Ticker(STEP_S, catch_up_s=CATCH_UP_S), 0
     while True:
         await ticker.tick()

@@ -13,17 +13,18 @@ from typing import Any
 import numpy as np
 
 from gateways.ros2.messages import (
+    STOPPED,
     BatteryState,
     CompressedImage,
-    Heard,
     Imu,
     LaserScan,
     OccupancyGrid,
     Odometry,
+    Received,
+    Velocity,
 )
+from gateways.ros2.options import RosOptions
 from gateways.ros2.session import RosRole
-from gateways.ros2.settings import Options
-from gateways.ros2.twists import REST, Velocity
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Battery, Drive, FleetMessage, Image, Map, Motion, Pose, Scan, Scanner
 from zbridge.fleet.topics import Topic
@@ -62,7 +63,7 @@ class RosRobot(Robot):
     link_names = ("router",)
     closing_harmless = True
 
-    def __init__(self, options: Options, links: int = 1, metrics: Metrics | None = None) -> None:
+    def __init__(self, options: RosOptions, links: int = 1, metrics: Metrics | None = None) -> None:
         metrics = metrics or Metrics()
         self.options = options
         self._types = types_of(options.distro)
@@ -107,11 +108,11 @@ class RosRobot(Robot):
             ranges[~((ranges >= low) & (ranges <= high))] = np.nan
         stamp, device_ms = self._stamps(message, stamp_ns)
         scan = Scan(first, increment, low, high, ranges, stamp_ns=stamp, device_ms=device_ms)
-        told = (first, first + increment * (count - 1), increment, float(body.time_increment), low, high, count)
-        if self._scanner is not None and self._scanner_fields(self._scanner) == told:
+        geometry = (first, first + increment * (count - 1), increment, float(body.time_increment), low, high, count)
+        if self._scanner is not None and self._scanner_fields(self._scanner) == geometry:
             return ((topics.SCAN, scan),)
-        _require(math.isfinite(told[3]), "scan with a time increment that is no number")
-        self._scanner = Scanner(*told, stamp_ns=stamp)
+        _require(math.isfinite(geometry[3]), "scan with a time increment that is no number")
+        self._scanner = Scanner(*geometry, stamp_ns=stamp)
         return ((topics.SCANNER, self._scanner), (topics.SCAN, scan))
 
     @staticmethod
@@ -183,7 +184,7 @@ class RosRobot(Robot):
         self._known |= {topic.path: message for topic, message in shown}
         return tuple(shown)
 
-    def _stamps(self, message: Heard, arrived_ns: int) -> tuple[int, int]:
+    def _stamps(self, message: Received, arrived_ns: int) -> tuple[int, int]:
         """Return the time of measurement on the gateway's clock, and the robot's own time in ms.
 
         The robot's clock may be simulated, wrong, or jump: a stamp that does not fit the arrival is not used.
@@ -220,7 +221,7 @@ class RosRobot(Robot):
         session = self._connected()
         if self.options.shared and until <= now and not session.moving:
             return  # another node may be driving it
-        session.drive(REST, now, until=until, urgent=True)
+        session.drive(STOPPED, now, until=until, urgent=True)
 
     def ask(self, topic: Topic) -> None:
         raise Unsupported(f"a ROS 2 robot cannot be asked for its {topic.path}")
@@ -265,7 +266,7 @@ def _known(value: float) -> float | None:
 _CHARGING = {1: True, 2: False, 3: False, 4: False}
 """power_supply_status: charging, discharging, not charging, full; 0 is unknown."""
 _FORMATS = (("jpeg", "jpeg"), ("jpg", "jpeg"), ("png", "png"))
-_TELEMETRY: dict[type[Heard], Callable[[RosRobot, Any, int], tuple[Telemetry, ...]]] = {
+_TELEMETRY: dict[type[Received], Callable[[RosRobot, Any, int], tuple[Telemetry, ...]]] = {
     LaserScan: RosRobot._scan,
     Odometry: RosRobot._odometry,
     Imu: RosRobot._imu,

@@ -1,18 +1,19 @@
 """The TCP/UDP package protocol: an HQ program with a joystick, a lidar, a SLAM map.
 
-``messages`` declares the packets, ``settings`` the settings blocks, ``versions`` the versions; ``session`` holds
-the conversation in both roles; ``translate`` is the device side, ``hq`` and ``maps`` the HQ side. ``simulator`` is a
-simulated robot; ``conformance`` has peers as fragile as deployed ones, which share no code with the rest.
+``messages`` declares the packets, ``settings`` the settings blocks and versions; ``session`` holds the conversation in
+both roles; ``translate`` and ``telemetry`` are the device side, ``hq``, ``hq_client`` and ``maps`` the HQ side,
+``options`` the options of both. ``simulator`` is a simulated robot; ``conformance`` has peers as fragile as deployed
+ones, which share no code with the rest.
 """
 
 from __future__ import annotations
 
-from gateways.tcpudp.hq import HqOptions, TcpUdpHq
+from gateways.tcpudp.hq import TcpUdpHq
 from gateways.tcpudp.messages import codecs
-from gateways.tcpudp.settings import HQ_BLOCKS
-from gateways.tcpudp.translate import NAME, Options, TcpUdpRobot
-from gateways.tcpudp.versions import VERSIONS
-from zbridge.protocol import Address, ConfigError, HqSimulation, Protocol, Simulation
+from gateways.tcpudp.options import NAME, TcpUdpHqOptions, TcpUdpOptions
+from gateways.tcpudp.settings import HQ_BLOCKS, VERSIONS
+from gateways.tcpudp.translate import TcpUdpRobot
+from zbridge.protocol import ConfigError, HqSimulation, Protocol, Simulation
 
 TEMPLATE = """\
 [device]
@@ -24,7 +25,7 @@ udp = true                              # use datagrams where the robot offers t
 gap_s = 0.01                            # least time between two packets: robots take one read as one packet
 force = []                              # features to use although the robot does not announce them, for
                                         # example ["joystick", "lidar"], and ids of raw packets it knows
-announce = ["udp", "lidar_sim"]         # features the gateway says it has; without "lidar_sim" a 1.4 robot sends no map
+announce = ["udp", "lidar_sim"]         # features the gateway announces; without "lidar_sim" a 1.4 robot sends no map
 combine = "exclusive"                   # drive that moves and turns: "exclusive" sends the larger, "both" both
 speed_full = 1.0                        # packet speed at full scale
 turn_full = 1.0                         # packet turn speed at full scale
@@ -35,12 +36,12 @@ map_cell_m = 0.01                       # side of a map cell where the robot doe
 """
 HQ_TEMPLATE = """\
 protocol = "tcpudp"
-listen = "tcp://127.0.0.1:11002"        # clients bind UDP 11000, and hear datagrams from this address and port
+listen = "tcp://127.0.0.1:11002"        # clients bind UDP 11000, and receive datagrams from this address and port only
 [hq.options]
 versions = ["1.1", "1.2", "1.3"]        # sent to the letter; programs of 1.1 or 1.2 understand only ["1.1"] or ["1.2"]
 udp = true                              # offer datagrams: 1.3 programs drive by nothing else
-client_port = 11000                     # the UDP port that programs bind: one whose packet 5 was lost is heard from
-                                        # there alone; 0: from nowhere
+client_port = 11000                     # the UDP port that programs bind: one whose packet 5 was lost is accepted
+                                        # from there alone; 0: from nowhere
 gap_s = 0.01                            # least time between two packets: programs take one read as one packet
 quiet_s = 2.0                           # before a client's id is given again
 known = []                              # packet ids that these programs know besides those of their version
@@ -64,16 +65,10 @@ async def _simulate(simulation: Simulation) -> None:
     if simulation.version is not None and simulation.version not in VERSIONS:
         raise ConfigError(f"version {simulation.version!r}: expected one of {', '.join(VERSIONS)}")
     if simulation.fragile:
-        from gateways.tcpudp.conformance.fragile_robot import simulate_fragile
+        from gateways.tcpudp.conformance.fragile_robot import FragileRobot
 
-        (address,), version = simulation.addresses, simulation.version or "1.3"
-
-        def ready(port: int) -> None:
-            simulation.ready((Address(address.host, port),))
-
-        await simulate_fragile(
-            address.host, address.port, version=version, udp=simulation.udp, seed=simulation.seed, ready=ready
-        )
+        robot = FragileRobot(version=simulation.version or "1.3", udp=simulation.udp, seed=simulation.seed)
+        await robot.simulate(simulation)
     else:
         from gateways.tcpudp.simulator import simulate
 
@@ -81,27 +76,26 @@ async def _simulate(simulation: Simulation) -> None:
 
 
 async def _simulate_hq(simulation: HqSimulation) -> None:
-    from gateways.tcpudp.conformance.fragile_hq import simulate_fragile_hq
+    from gateways.tcpudp.conformance.fragile_hq import FragileTcpUdpHq
 
-    version = simulation.version or "1.3"
+    version, address = simulation.version or "1.3", simulation.address
     if simulation.dialect is not None:
         raise ConfigError("TCP/UDP HQ programs have no dialects")
     if version not in HQ_BLOCKS:
         raise ConfigError(f"version {version!r}: expected one of {', '.join(HQ_BLOCKS)}")
     udp = simulation.udp or version == "1.3"  # deployed programs of 1.3 drive by nothing else
-    address = simulation.address
-    await simulate_fragile_hq(address.host, address.port, version=version, udp=udp, drive=simulation.drive)
+    await FragileTcpUdpHq(version=version, udp=udp).simulate(address.host, address.port, simulation.drive)
 
 
 PROTOCOL = Protocol(
     name=NAME,
     summary="TCP/UDP package protocol: joystick, lidar, SLAM map",
-    options=Options,
+    options=TcpUdpOptions,
     links=1,
     robot=TcpUdpRobot,
     simulate=_simulate,
     hq=TcpUdpHq,
-    hq_options=HqOptions,
+    hq_options=TcpUdpHqOptions,
     simulate_hq=_simulate_hq,
     template=TEMPLATE,
     codecs=codecs(),

@@ -46,8 +46,8 @@ def most_side(packet_bytes: int) -> int:
     return math.isqrt(packet_bytes - _AROUND)
 
 
-class Frame(msgspec.Struct, frozen=True):
-    """Where HQ programs assume a square grid to lie; the protocol does not say.
+class MapFrame(msgspec.Struct, frozen=True):
+    """Where HQ programs assume a square grid to lie; the protocol does not define it.
 
     own: the map is of a robot of this protocol, whose programs expect its zero at the same fraction of the grid as
     before; else the grid is centred on zero. origin: x, y of the first cell, metres; it overrides both.
@@ -78,10 +78,10 @@ class Frame(msgspec.Struct, frozen=True):
         return (x - grid.origin[0], y - grid.origin[1])
 
 
-_OWN = Frame(own=True)
+_OWN = MapFrame(own=True)
 
 
-def announceable(grid: Map, unit_m: float, most: int, frame: Frame = _OWN) -> Geometry:
+def announceable(grid: Map, unit_m: float, most: int, frame: MapFrame = _OWN) -> Geometry:
     """Return the geometry to announce for a map: its own cells if whole units and few enough, else larger ones.
 
     unit_m: the robot's unit of length. most: cells along a side at most. Raises EncodeError for cells of a size that

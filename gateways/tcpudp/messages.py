@@ -15,11 +15,11 @@ from typing import ClassVar, TypeVar
 import msgspec
 
 from gateways.tcpudp.settings import Feature
-from zbridge.protocol import Codec, EncodeError, ProtocolError
+from zbridge.protocol import Codec, Datagram, EncodeError, ProtocolError
 from zbridge.wire import F32, I32, U8, BinaryCodec, Blob, Bool, F32Array, Message, Rest, Text
 
 MAX_FRAME = 4 * 2**20 + 64
-"""Bytes of the longest packet that is taken: a map of 2048 x 2048 with its header."""
+"""Bytes of the longest packet that is accepted: a map of 2048 x 2048 with its header."""
 HEADER = struct.Struct("<iBB")
 _HEADER_SIZE = HEADER.size
 _LENGTH = struct.Struct("<i").unpack_from
@@ -27,7 +27,7 @@ SERVER_ID = 1
 """The ``id`` byte of every packet from the robot."""
 
 
-class Sender(Enum):
+class PacketSender(Enum):
     """Who sends a packet."""
 
     ROBOT = "robot"
@@ -46,13 +46,13 @@ class Carrier(Enum):
 class Packet(Message, frozen=True):
     """A message of this protocol."""
 
-    spec: ClassVar[Spec]
+    spec: ClassVar[PacketSpec]
 
 
 P = TypeVar("P", bound=Packet)
 
 
-class Spec(msgspec.Struct, frozen=True, eq=False):
+class PacketSpec(msgspec.Struct, frozen=True, eq=False):
     """A row of the packet table.
 
     features: a robot that announces any of these has registered the packet; none means always.
@@ -60,24 +60,24 @@ class Spec(msgspec.Struct, frozen=True, eq=False):
 
     id: int
     name: str
-    sender: Sender
+    sender: PacketSender
     carrier: Carrier
     features: tuple[Feature, ...]
     packet: type[Packet]
     codec: BinaryCodec[Packet]
 
 
-PACKETS: dict[int, Spec] = {}
+PACKETS: dict[int, PacketSpec] = {}
 """The packet table, by packet id."""
 
 
 def packet(
-    packet_id: int, name: str, sender: Sender, carrier: Carrier = Carrier.TCP, needs: tuple[Feature, ...] = ()
+    packet_id: int, name: str, sender: PacketSender, carrier: Carrier = Carrier.TCP, needs: tuple[Feature, ...] = ()
 ) -> Callable[[type[P]], type[P]]:
     """Enter a declaration into the packet table."""
 
     def enter(declared: type[P]) -> type[P]:
-        spec = Spec(packet_id, name, sender, carrier, needs, declared, BinaryCodec(declared))
+        spec = PacketSpec(packet_id, name, sender, carrier, needs, declared, BinaryCodec(declared))
         declared.spec = PACKETS[packet_id] = spec
         return declared
 
@@ -88,14 +88,14 @@ _JOYSTICK = (Feature.JOYSTICK,)
 _MAPPING = (Feature.SLAM_MAP, Feature.LIDAR)
 
 
-@packet(1, "debugMessage", Sender.BOTH)
+@packet(1, "debugMessage", PacketSender.BOTH)
 class DebugMessage(Packet, frozen=True):
     """A text for people; an empty one crashes deployed robots."""
 
     text: Text
 
 
-@packet(2, "serverSettings", Sender.ROBOT)
+@packet(2, "serverSettings", PacketSender.ROBOT)
 class ServerSettings(Packet, frozen=True):
     """The robot speaks first. ``block`` is the settings block of the newest version listed."""
 
@@ -104,7 +104,7 @@ class ServerSettings(Packet, frozen=True):
     block: Rest
 
 
-@packet(3, "clientSettings", Sender.HQ)
+@packet(3, "clientSettings", PacketSender.HQ)
 class ClientSettings(Packet, frozen=True):
     """The HQ's answer. ``block`` is the settings block of the newest version listed."""
 
@@ -112,38 +112,38 @@ class ClientSettings(Packet, frozen=True):
     block: Rest
 
 
-@packet(4, "serverStartUDP", Sender.ROBOT)
+@packet(4, "serverStartUDP", PacketSender.ROBOT)
 class ServerStartUDP(Packet, frozen=True):
     """The robot waits for the HQ's datagram."""
 
 
-@packet(5, "clientUDPConnection", Sender.HQ, Carrier.UDP)
+@packet(5, "clientUDPConnection", PacketSender.HQ, Carrier.UDP)
 class ClientUDPConnection(Packet, frozen=True):
-    """The datagram that tells the robot where the HQ's socket is."""
+    """The datagram that shows the robot the address of the HQ's socket."""
 
 
-@packet(6, "serverUDPConnection", Sender.ROBOT, Carrier.UDP)
+@packet(6, "serverUDPConnection", PacketSender.ROBOT, Carrier.UDP)
 class ServerUDPConnection(Packet, frozen=True):
     """Whether that datagram arrived; comes by UDP if it did, by TCP if not."""
 
     received: Bool
 
 
-@packet(7, "clientUDPConnectionStatus", Sender.HQ)
+@packet(7, "clientUDPConnectionStatus", PacketSender.HQ)
 class ClientUDPConnectionStatus(Packet, frozen=True):
     """Whether the robot's datagram arrived."""
 
     connected: Bool
 
 
-@packet(10, "clientControllMode", Sender.HQ, needs=_JOYSTICK)
+@packet(10, "clientControllMode", PacketSender.HQ, needs=_JOYSTICK)
 class ClientControllMode(Packet, frozen=True):
     """1 none, 2 joystick, 3 AI."""
 
     mode: I32
 
 
-@packet(11, "clientJoystickMove", Sender.HQ, Carrier.UDP_IF_AGREED, needs=_JOYSTICK)
+@packet(11, "clientJoystickMove", PacketSender.HQ, Carrier.UDP_IF_AGREED, needs=_JOYSTICK)
 class ClientJoystickMove(Packet, frozen=True):
     """Move along (x right, y forward), a vector of length 1 at most."""
 
@@ -152,59 +152,59 @@ class ClientJoystickMove(Packet, frozen=True):
     speed: F32
 
 
-@packet(12, "clientJoystickRotate", Sender.HQ, Carrier.UDP_IF_AGREED, needs=_JOYSTICK)
+@packet(12, "clientJoystickRotate", PacketSender.HQ, Carrier.UDP_IF_AGREED, needs=_JOYSTICK)
 class ClientJoystickRotate(Packet, frozen=True):
     """Turn on the spot, positive to the right."""
 
     speed: F32
 
 
-@packet(13, "clientJoystickStop", Sender.HQ, needs=_JOYSTICK)
+@packet(13, "clientJoystickStop", PacketSender.HQ, needs=_JOYSTICK)
 class ClientJoystickStop(Packet, frozen=True):
     """Stand still."""
 
 
-@packet(21, "clientMoveAI", Sender.HQ, needs=_JOYSTICK)
+@packet(21, "clientMoveAI", PacketSender.HQ, needs=_JOYSTICK)
 class ClientMoveAI(Packet, frozen=True):
     """Not defined by the document: opaque."""
 
     body: Rest = b""
 
 
-@packet(31, "serverCamMode", Sender.ROBOT)
+@packet(31, "serverCamMode", PacketSender.ROBOT)
 class ServerCamMode(Packet, frozen=True):
     """1 on, 2 off."""
 
     mode: I32
 
 
-@packet(40, "chatMessage", Sender.BOTH, needs=(Feature.CHAT,))
+@packet(40, "chatMessage", PacketSender.BOTH, needs=(Feature.CHAT,))
 class ChatMessage(Packet, frozen=True):
     """Not defined by the document: opaque."""
 
     body: Rest = b""
 
 
-@packet(50, "clientLidarMode", Sender.HQ, needs=(Feature.LIDAR,))
+@packet(50, "clientLidarMode", PacketSender.HQ, needs=(Feature.LIDAR,))
 class ClientLidarMode(Packet, frozen=True):
     """1 on, 2 off."""
 
     mode: I32
 
 
-@packet(51, "serverLidarStatus", Sender.ROBOT)
+@packet(51, "serverLidarStatus", PacketSender.ROBOT)
 class ServerLidarStatus(Packet, frozen=True):
     """1 on, 2 off."""
 
     mode: I32
 
 
-@packet(52, "clientGetSLAMMap", Sender.HQ, needs=_MAPPING)
+@packet(52, "clientGetSLAMMap", PacketSender.HQ, needs=_MAPPING)
 class ClientGetSLAMMap(Packet, frozen=True):
     """Ask for the map."""
 
 
-@packet(53, "servertSLAMMap", Sender.ROBOT, Carrier.UDP_IF_AGREED)
+@packet(53, "servertSLAMMap", PacketSender.ROBOT, Carrier.UDP_IF_AGREED)
 class ServerSLAMMap(Packet, frozen=True):
     """The map: 0 unknown, 1 free, 2 obstacle, index = x * side + y. Empty: no map yet.
 
@@ -215,12 +215,12 @@ class ServerSLAMMap(Packet, frozen=True):
     cells: Blob = b""
 
 
-@packet(54, "clientGetPosition", Sender.HQ, needs=_MAPPING)
+@packet(54, "clientGetPosition", PacketSender.HQ, needs=_MAPPING)
 class ClientGetPosition(Packet, frozen=True):
     """Ask for the position."""
 
 
-@packet(55, "serverPosition", Sender.ROBOT, Carrier.UDP_IF_AGREED)
+@packet(55, "serverPosition", PacketSender.ROBOT, Carrier.UDP_IF_AGREED)
 class ServerPosition(Packet, frozen=True):
     """Position in the robot's length unit, heading in degrees."""
 
@@ -229,7 +229,7 @@ class ServerPosition(Packet, frozen=True):
     heading_deg: F32
 
 
-@packet(56, "servertSLAMMapPart", Sender.ROBOT, Carrier.UDP_IF_AGREED)
+@packet(56, "servertSLAMMapPart", PacketSender.ROBOT, Carrier.UDP_IF_AGREED)
 class ServerSLAMMapPart(Packet, frozen=True):
     """Cells ``start`` to ``end`` (exclusive) of the map; sent by robots that list "1.4", one a second."""
 
@@ -242,12 +242,12 @@ class ServerSLAMMapPart(Packet, frozen=True):
             raise ProtocolError(f"map part {self.start} to {self.end} with {len(self.cells)} cells")
 
 
-@packet(60, "serverGetSimulatedLidarData", Sender.ROBOT)
+@packet(60, "serverGetSimulatedLidarData", PacketSender.ROBOT)
 class ServerGetSimulatedLidarData(Packet, frozen=True):
     """The robot asks for simulated lidar data."""
 
 
-@packet(61, "clientSimulatedLidarData", Sender.HQ, Carrier.UDP_IF_AGREED, needs=(Feature.LIDAR_SIM,))
+@packet(61, "clientSimulatedLidarData", PacketSender.HQ, Carrier.UDP_IF_AGREED, needs=(Feature.LIDAR_SIM,))
 class ClientSimulatedLidarData(Packet, frozen=True, eq=False):
     """float32[360] ranges in the robot's length unit, index = degree."""
 
@@ -275,14 +275,19 @@ def frame_end(data: bytes, start: int) -> int:
     return start + 4 + length
 
 
-def encode_packet(message: Packet, sender_id: int) -> bytes:
-    """Write a packet with its header; raise EncodeError for values that do not fit."""
+def encode_packet(message: Packet, sender_id: int, transport: str = "tcp") -> bytes:
+    """Write a packet with its header, a Datagram if ``transport`` is ``udp`` and the table says UDP*.
+
+    Raise EncodeError for values that do not fit.
+    """
+    carrier = Carrier.TCP
     if isinstance(message, OpaquePacket):
         packet_id, body = message.id, message.body
     else:
-        packet_id, body = message.spec.id, message.spec.codec.encode(message)
+        packet_id, body, carrier = message.spec.id, message.spec.codec.encode(message), message.spec.carrier
     try:
-        return HEADER.pack(2 + len(body), sender_id, packet_id) + body
+        frame = HEADER.pack(2 + len(body), sender_id, packet_id) + body
+        return Datagram(frame) if transport == "udp" and carrier is Carrier.UDP_IF_AGREED else frame
     except struct.error as error:
         raise EncodeError(f"packet {packet_id} from {sender_id}: {error}") from error
 

@@ -13,29 +13,10 @@ import random
 import msgspec
 import numpy as np
 
-from gateways.tcpudp.messages import (
-    ChatMessage,
-    ClientControllMode,
-    ClientGetPosition,
-    ClientGetSLAMMap,
-    ClientJoystickMove,
-    ClientJoystickRotate,
-    ClientJoystickStop,
-    ClientLidarMode,
-    ClientMoveAI,
-    ClientSimulatedLidarData,
-    DebugMessage,
-    Packet,
-    ServerCamMode,
-    ServerGetSimulatedLidarData,
-    ServerLidarStatus,
-    ServerPosition,
-    ServerSLAMMap,
-    ServerSLAMMapPart,
-)
-from gateways.tcpudp.session import RobotRole, limits
-from gateways.tcpudp.settings import ROBOT_BLOCKS, Feature, RobotSettings13, Settings
-from gateways.tcpudp.versions import VERSIONS
+from gateways.tcpudp import messages as packets
+from gateways.tcpudp.session import limits
+from gateways.tcpudp.session.robot_role import RobotRole
+from gateways.tcpudp.settings import ROBOT_BLOCKS, VERSIONS, Feature, RobotSettings13, Settings
 from zbridge.protocol import ClientIds, Session, Simulation
 from zbridge.simulation.simulator import STEP_S, Simulator
 from zbridge.simulation.world import Body, Grid, cast
@@ -84,64 +65,64 @@ class Vehicle:
         self.lidar = True
         self._rng = rng
         self._motion = (0.0, 0.0, 0.0)
-        self._silent_s = 0.0
+        self._idle_s = 0.0
 
     def __repr__(self) -> str:
         return f"<Vehicle {self.body} moving {self._motion}>"
 
     @property
     def moving(self) -> bool:
-        """True while it moves as it was told."""
+        """True while it moves as commanded."""
         return any(self._motion)
 
     def step(self, dt: float) -> None:
         """Live for ``dt`` seconds."""
-        self._silent_s += dt
-        if self._silent_s > SILENCE_S:
+        self._idle_s += dt
+        if self._idle_s > SILENCE_S:
             self._motion = (0.0, 0.0, 0.0)
         self.body.step(*self._motion, dt)
 
-    def look(self) -> None:
+    def sweep_lidar(self) -> None:
         """Enter one sweep of its own lidar into the map."""
         angles = self.body.heading + _DEGREES
         ranges = cast(self.body.x, self.body.y, angles, LIDAR_RANGE_M)
         noise = np.array([self._rng.gauss(0.0, 0.005) for _ in range(len(ranges))])
         self.grid.see(self.body.x, self.body.y, angles, ranges + noise * (ranges < LIDAR_RANGE_M), LIDAR_RANGE_M)
 
-    def position(self) -> ServerPosition:
+    def position(self) -> packets.ServerPosition:
         """Give its place: x, y in its unit, heading in degrees with 0 along y."""
         heading_deg = math.degrees(self.body.heading - math.pi / 2)
-        return ServerPosition(self.body.x / UNIT_M, self.body.y / UNIT_M, heading_deg)
+        return packets.ServerPosition(self.body.x / UNIT_M, self.body.y / UNIT_M, heading_deg)
 
-    def map(self) -> ServerSLAMMap:
+    def map(self) -> packets.ServerSLAMMap:
         """Give the map, x-major."""
-        return ServerSLAMMap(self.grid.cells.tobytes())
+        return packets.ServerSLAMMap(self.grid.cells.tobytes())
 
-    def take(self, message: Packet) -> tuple[Packet, ...]:
+    def take(self, message: packets.Packet) -> tuple[packets.Packet, ...]:
         """Obey or answer one packet of an HQ."""
         match message:
-            case ClientJoystickMove():
+            case packets.ClientJoystickMove():
                 self._move(message.y * message.speed * SPEED_M_S, -message.x * message.speed * SPEED_M_S, 0.0)
-            case ClientJoystickRotate():
+            case packets.ClientJoystickRotate():
                 self._move(0.0, 0.0, -message.speed * TURN_RAD_S)
-            case ClientJoystickStop():
+            case packets.ClientJoystickStop():
                 self._move(0.0, 0.0, 0.0)
-            case ClientControllMode():
+            case packets.ClientControllMode():
                 self.mode = message.mode
-            case ClientLidarMode():
+            case packets.ClientLidarMode():
                 self.lidar = message.mode == 1
-                return (ServerLidarStatus(1 if self.lidar else 2),)
-            case ClientGetPosition():
+                return (packets.ServerLidarStatus(1 if self.lidar else 2),)
+            case packets.ClientGetPosition():
                 return (self.position(),)
-            case ClientGetSLAMMap():
+            case packets.ClientGetSLAMMap():
                 return (self.map(),)
-            case DebugMessage():
-                return (DebugMessage(f"echo: {message.text}"),)
-            case ChatMessage():
+            case packets.DebugMessage():
+                return (packets.DebugMessage(f"echo: {message.text}"),)
+            case packets.ChatMessage():
                 return (message,)
-            case ClientMoveAI():
-                return (DebugMessage("clientMoveAI taken"),)
-            case ClientSimulatedLidarData():
+            case packets.ClientMoveAI():
+                return (packets.DebugMessage("clientMoveAI taken"),)
+            case packets.ClientSimulatedLidarData():
                 self._see(message)
         return ()
 
@@ -150,9 +131,9 @@ class Vehicle:
         finite = all(math.isfinite(value) for value in (forward, left, turn))
         scale = max(math.hypot(forward, left) / SPEED_M_S, abs(turn) / TURN_RAD_S, 1.0)
         self._motion = (forward / scale, left / scale, turn / scale) if finite else (0.0, 0.0, 0.0)
-        self._silent_s = 0.0
+        self._idle_s = 0.0
 
-    def _see(self, message: ClientSimulatedLidarData) -> None:
+    def _see(self, message: packets.ClientSimulatedLidarData) -> None:
         ranges = message.ranges.astype(np.float64) * UNIT_M
         if len(ranges) == len(_DEGREES):
             known = np.isfinite(ranges) & (ranges > 0)
@@ -160,13 +141,13 @@ class Vehicle:
             self.grid.see(self.body.x, self.body.y, angles, ranges[known], LIDAR_RANGE_M)
 
 
-class RobotSimulator(Simulator[Packet]):
+class RobotSimulator(Simulator[packets.Packet]):
     """Serves one vehicle to the HQ programs that connect."""
 
     def __init__(self, seed: int, version: str = "1.3", *, udp: bool = False) -> None:
         super().__init__(log, datagrams=udp)
         self.vehicle = Vehicle(seed)
-        self.vehicle.look()
+        self.vehicle.sweep_lidar()
         self._versions = VERSIONS[version].listed.split(",")
         self._settings = settings_of(version, udp=udp)
         self._parts = version == "1.4"
@@ -188,15 +169,15 @@ class RobotSimulator(Simulator[Packet]):
         assert isinstance(client.session, RobotRole)
         self._ids.release(client.session.client_id, self._loop.time())
 
-    def check(self, session: Session[Packet], message: Packet) -> None:
+    def check(self, session: Session[packets.Packet], message: packets.Packet) -> None:
         """Refuse what the HQ does not know; deployed robots send parts of the map without that check."""
         assert isinstance(session, RobotRole)
-        if not isinstance(message, ServerSLAMMapPart):
+        if not isinstance(message, packets.ServerSLAMMapPart):
             session.may_send(message)
 
-    def take(self, client: Conversation, message: Packet) -> None:
+    def take(self, client: Conversation, message: packets.Packet) -> None:
         """Let the vehicle obey and answer; the handler of 52 is empty in robots that send parts."""
-        if not (self._parts and isinstance(message, ClientGetSLAMMap)):
+        if not (self._parts and isinstance(message, packets.ClientGetSLAMMap)):
             for answer in self.vehicle.take(message):
                 self.send(client, answer)
 
@@ -206,23 +187,23 @@ class RobotSimulator(Simulator[Packet]):
             self.tell(self.vehicle.position())
         if steps % _MAP_EVERY == 0:
             if self.vehicle.lidar:
-                self.vehicle.look()
+                self.vehicle.sweep_lidar()
             if self._parts:
-                self._tell_part(steps // _MAP_EVERY)
+                self._send_part(steps // _MAP_EVERY)
             else:
                 self.tell(self.vehicle.map())
         if steps % _ASK_EVERY == _ASK_EVERY // 2:
-            self.tell(ServerGetSimulatedLidarData())
+            self.tell(packets.ServerGetSimulatedLidarData())
         if steps == _ASK_EVERY:
-            self.tell(ServerCamMode(2))
-            self.tell(ServerLidarStatus(1))
+            self.tell(packets.ServerCamMode(2))
+            self.tell(packets.ServerLidarStatus(1))
 
-    def _tell_part(self, number: int) -> None:
+    def _send_part(self, number: int) -> None:
         """Send a part of the map to every HQ that announced LidarSim, as deployed robots do."""
         cells = self.vehicle.grid.cells.tobytes()
         size = -(-len(cells) // PARTS)
         start = number % PARTS * size
-        part = ServerSLAMMapPart(start, min(start + size, len(cells)), cells[start : start + size])
+        part = packets.ServerSLAMMapPart(start, min(start + size, len(cells)), cells[start : start + size])
         for client in self.clients():
             if Feature.LIDAR_SIM.value in client.session.features:
                 self.send(client, part)

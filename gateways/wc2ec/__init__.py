@@ -1,17 +1,18 @@
 """WC2EC: Webots robots, by the controller program of the simulation, in the field's dialect or the document's.
 
-``messages`` declares the messages of both dialects; ``devices`` is the table of a robot's devices; ``session`` holds
-the conversation in both roles; ``settings`` and ``translate`` are the device side, ``hq`` the HQ side. ``simulator`` is
-a simulated robot; ``conformance`` has peers as fragile as deployed ones, which share no code with the rest.
+``messages`` declares the messages of both dialects; ``session`` holds the conversation in both roles; ``devices`` and
+``translate`` are the device side, ``hq``, ``hq_client`` and ``device_table`` the HQ side, ``options`` the options of
+both. ``simulator`` is a simulated robot; ``conformance`` has peers as fragile as deployed ones, which share no code
+with the rest.
 """
 
 from __future__ import annotations
 
-from gateways.wc2ec.hq import HqOptions, Wc2EcHq
-from gateways.wc2ec.messages import Dialect, codecs
-from gateways.wc2ec.settings import Options
+from gateways.wc2ec.hq import Wc2EcHq
+from gateways.wc2ec.messages import Wc2EcDialect, codecs
+from gateways.wc2ec.options import Wc2EcHqOptions, Wc2EcOptions
 from gateways.wc2ec.translate import NAME, Wc2EcRobot
-from zbridge.protocol import Address, ConfigError, HqSimulation, Protocol, Simulation
+from zbridge.protocol import ConfigError, HqSimulation, Protocol, Simulation
 
 TEMPLATE = """\
 [device]
@@ -25,7 +26,7 @@ motor_types = { rotational = [53], linear = [46] }  # type bytes that are motors
 # bounds_default = [0.0, 1000.0]        # readings outside are faults; these bounds are the deployed application's
 # bounds = { front = [-1.0, 5000.0] }   # others for some sensors
 # tables = { front = [[0.0, 1.0], [1000.0, 0.02]] }  # from a sensor's value to metres (or irradiance), interpolated
-# bearings_deg = { front = 0.0, left = 90.0 }  # where distance sensors look, counter-clockwise: they make a scan
+# bearings_deg = { front = 0.0, left = 90.0 }  # directions of distance sensors, counter-clockwise: they make a scan
 # scan_range_m = [0.0, 10.0]
 # devices = [{ name = "light0", number = 0 }]  # draft only: the devices there are, kind = "light" by default
 # pinned = ["light0"]                   # draft only: sensors that measure though nobody listens
@@ -71,11 +72,11 @@ SIMULATED = {
 }
 
 
-def _dialect(name: str | None) -> Dialect:
+def _dialect(name: str | None) -> Wc2EcDialect:
     try:
-        return Dialect(name or "deployed")
+        return Wc2EcDialect(name or "deployed")
     except ValueError:
-        names = ", ".join(dialect.value for dialect in Dialect)
+        names = ", ".join(dialect.value for dialect in Wc2EcDialect)
         raise ConfigError(f"dialect {name!r}: expected one of {names}") from None
 
 
@@ -85,14 +86,10 @@ async def _simulate(simulation: Simulation) -> None:
     if len(simulation.addresses) > 1:
         raise ConfigError("a Webots robot has one link")
     dialect = _dialect(simulation.dialect)
-    (address,) = simulation.addresses
     if simulation.fragile:
-        from gateways.wc2ec.conformance.fragile_robot import simulate_fragile
+        from gateways.wc2ec.conformance.fragile_robot import FragileWebotsController
 
-        def ready(port: int) -> None:
-            simulation.ready((Address(address.host, port),))
-
-        await simulate_fragile(address.host, address.port, dialect=dialect.value, seed=simulation.seed, ready=ready)
+        await FragileWebotsController(dialect.value, seed=simulation.seed).simulate(simulation)
     else:
         from gateways.wc2ec.simulator import simulate
 
@@ -100,25 +97,24 @@ async def _simulate(simulation: Simulation) -> None:
 
 
 async def _simulate_hq(simulation: HqSimulation) -> None:
-    from gateways.wc2ec.conformance.fragile_hq import simulate_fragile_hq
+    from gateways.wc2ec.conformance.fragile_hq import FragileExternalController
 
     if simulation.version is not None or simulation.udp:
         raise ConfigError("external controllers have no versions and no datagrams")
-    dialect = _dialect(simulation.dialect)
-    address = simulation.address
-    await simulate_fragile_hq(address.host, address.port, dialect=dialect.value, drive=simulation.drive)
+    dialect, address = _dialect(simulation.dialect), simulation.address
+    await FragileExternalController(dialect=dialect.value).simulate(address.host, address.port, simulation.drive)
 
 
 PROTOCOL = Protocol(
     name=NAME,
     summary="WC2EC: Webots robots, by their controller program",
-    options=Options,
+    options=Wc2EcOptions,
     links=1,
     robot=Wc2EcRobot,
     simulate=_simulate,
     simulated=SIMULATED,
     hq=Wc2EcHq,
-    hq_options=HqOptions,
+    hq_options=Wc2EcHqOptions,
     simulate_hq=_simulate_hq,
     template=TEMPLATE,
     codecs=codecs(),

@@ -32,12 +32,14 @@ class WebotsDevice(msgspec.Struct, frozen=True):
         return self.kind in (ROTATIONAL, LINEAR)
 
 
-class Table(Kept):
+class RegisteredDevices(Kept):
     """The devices of one session, by number and by name."""
 
     kept: ClassVar[dict[str, Any]] = {
         "collisions": list[str],
-        "_by_number": Form(lambda table: [_written(device) for device in table.values()], lambda raw: _read(raw)),
+        "_by_number": Form(
+            lambda table: [_write_device(device) for device in table.values()], lambda raw: _read_devices(raw)
+        ),
     }
 
     def __init__(self) -> None:
@@ -46,7 +48,7 @@ class Table(Kept):
         self._by_name: dict[str, WebotsDevice] = {}
 
     def __repr__(self) -> str:
-        return f"<Table of {len(self._by_number)} devices>"
+        return f"<RegisteredDevices of {len(self._by_number)}>"
 
     def restore(self, state: Exported) -> None:
         super().restore(state)
@@ -103,14 +105,14 @@ def kind_of(kind_byte: int, motor_types: dict[str, tuple[int, ...]]) -> str:
     return _SENSOR_KINDS.get(kind_byte, f"type{kind_byte}")
 
 
-def _written(device: WebotsDevice) -> list[Any]:
+def _write_device(device: WebotsDevice) -> list[Any]:
     """Write a device as MessagePack holds it: a name may have bytes that are not UTF-8."""
     name = device.name.encode("utf-8", "surrogateescape")
     shown = None if device.shown == device.name else device.shown
     return [name, shown, device.number, device.type, device.kind]
 
 
-def _read(raw: Any) -> dict[int, WebotsDevice]:
+def _read_devices(raw: Any) -> dict[int, WebotsDevice]:
     devices = {}
     for written, shown, number, kind_byte, kind in msgspec.convert(raw, list[tuple[bytes, str | None, int, int, str]]):
         name = written.decode("utf-8", "surrogateescape")

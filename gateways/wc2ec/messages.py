@@ -1,7 +1,7 @@
 """The messages of WC2EC, each declared once for all dialects that have it, and their framing.
 
 Source: "Dialect `draft`" and "Dialect `deployed`" of the protocol page. Every message begins with a byte of command,
-one of sensor type and one of sensor number; the command tells how the rest is read. Sans-IO.
+one of sensor type and one of sensor number; the command determines the rest. Sans-IO.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ MAX_FRAME = 4096
 _QUOTED = 16
 
 
-class Dialect(Enum):
+class Wc2EcDialect(Enum):
     """The document's first draft, or the dialect of deployed programs."""
 
     DRAFT = "draft"
     DEPLOYED = "deployed"
 
 
-class Sender(Enum):
+class Wc2EcSender(Enum):
     """Who sends a message: the Webots controller or the external one."""
 
     WC = "Webots controller"
@@ -44,14 +44,14 @@ class Wc2EcMessage(Message, frozen=True):
     kind: U8
     number: U8
 
-    commands: ClassVar[dict[Dialect, int]]
+    commands: ClassVar[dict[Wc2EcDialect, int]]
 
 
 W = TypeVar("W", bound=Wc2EcMessage)
 Name = Annotated[bytes, CountedBytes("B")]
 
 
-class Spec(msgspec.Struct, frozen=True, eq=False):
+class Wc2EcSpec(msgspec.Struct, frozen=True, eq=False):
     """A row of a dialect's table."""
 
     command: int
@@ -60,12 +60,12 @@ class Spec(msgspec.Struct, frozen=True, eq=False):
     codec: BinaryCodec[Wc2EcMessage]
 
     @property
-    def sender(self) -> Sender:
-        """Who sends it: the command tells."""
-        return Sender.WC if self.command in FROM_CONTROLLER else Sender.EC
+    def sender(self) -> Wc2EcSender:
+        """Who sends it, by its command."""
+        return Wc2EcSender.WC if self.command in FROM_CONTROLLER else Wc2EcSender.EC
 
 
-MESSAGES: dict[Dialect, dict[int, Spec]] = {dialect: {} for dialect in Dialect}
+MESSAGES: dict[Wc2EcDialect, dict[int, Wc2EcSpec]] = {dialect: {} for dialect in Wc2EcDialect}
 """The tables, by command."""
 
 
@@ -73,9 +73,9 @@ def message(name: str, **commands: int) -> Callable[[type[W]], type[W]]:
     """Enter a declaration into the tables of its dialects: ``draft`` and ``deployed`` give its command there."""
 
     def enter(declared: type[W]) -> type[W]:
-        declared.commands = {Dialect(dialect): command for dialect, command in commands.items()}
+        declared.commands = {Wc2EcDialect(dialect): command for dialect, command in commands.items()}
         for dialect, command in declared.commands.items():
-            MESSAGES[dialect][command] = Spec(command, name, declared, BinaryCodec(declared))
+            MESSAGES[dialect][command] = Wc2EcSpec(command, name, declared, BinaryCodec(declared))
         return declared
 
     return enter
@@ -132,14 +132,14 @@ class SetValue(Wc2EcMessage, frozen=True):
     value: F64
 
 
-def frame_end(dialect: Dialect, sender: Sender, *, values: int = 0) -> FrameEnd:
+def frame_end(dialect: Wc2EcDialect, sender: Wc2EcSender, *, values: int = 0) -> FrameEnd:
     """Make the framing function for what one side sends. ``values``: configuration values of a sensor.
 
-    A command that the side cannot send breaks the stream: nothing tells how long it is.
+    A command that the side cannot send breaks the stream: its length is unknown.
     """
     specs = {command: spec for command, spec in MESSAGES[dialect].items() if spec.sender is sender}
     sizes = {command: 1 + spec.codec.fixed_size for command, spec in specs.items()}
-    registration = RegisterSensor.commands.get(dialect) if sender is Sender.WC else None
+    registration = RegisterSensor.commands.get(dialect) if sender is Wc2EcSender.WC else None
     if (setting := SetSensor.commands.get(dialect)) in sizes:
         sizes[setting] += 8 * values
 
@@ -148,7 +148,9 @@ def frame_end(dialect: Dialect, sender: Sender, *, values: int = 0) -> FrameEnd:
         size = sizes.get(command)
         if size is None:
             half = (
-                "" if (command in FROM_CONTROLLER) is (sender is Sender.WC) else ", which is of the other side's half"
+                ""
+                if (command in FROM_CONTROLLER) is (sender is Wc2EcSender.WC)
+                else ", which is of the other side's half"
             )
             quoted = data[start : start + _QUOTED].hex(" ")
             raise ProtocolError(f"command {command}{half}, expected one of {sorted(sizes)}: {quoted}")
@@ -160,12 +162,12 @@ def frame_end(dialect: Dialect, sender: Sender, *, values: int = 0) -> FrameEnd:
     return end
 
 
-def read(frame: bytes, dialect: Dialect) -> Wc2EcMessage:
+def read(frame: bytes, dialect: Wc2EcDialect) -> Wc2EcMessage:
     """Read one message; the framing has checked the command."""
     return MESSAGES[dialect][frame[0]].codec.decode(frame, 1)
 
 
-def write(message: Wc2EcMessage, dialect: Dialect) -> bytes:
+def write(message: Wc2EcMessage, dialect: Wc2EcDialect) -> bytes:
     """Write one message; raise EncodeError for a value that its type cannot carry."""
     command = message.commands[dialect]
     return bytes((command,)) + MESSAGES[dialect][command].codec.encode(message)
@@ -181,6 +183,6 @@ def codecs() -> tuple[Codec, ...]:
             frame_end(dialect, sender, values=2),
             tuple(spec.message for spec in MESSAGES[dialect].values() if spec.sender is sender),
         )
-        for dialect in Dialect
-        for sender in Sender
+        for dialect in Wc2EcDialect
+        for sender in Wc2EcSender
     )

@@ -11,11 +11,11 @@ from typing import Any, ClassVar
 
 from gateways.wc2ec.messages import (
     MAX_FRAME,
-    Dialect,
     RegisterSensor,
-    Sender,
     SensorData,
+    Wc2EcDialect,
     Wc2EcMessage,
+    Wc2EcSender,
     frame_end,
     read,
     write,
@@ -35,9 +35,9 @@ class Wc2EcSession(Session[Wc2EcMessage]):
     bounds: what a listener demands of its clients.
     """
 
-    _PEER: Sender
+    _PEER: Wc2EcSender
 
-    def __init__(self, dialect: Dialect, *, values: int = 0, bounds: Limits = _BOUNDS) -> None:
+    def __init__(self, dialect: Wc2EcDialect, *, values: int = 0, bounds: Limits = _BOUNDS) -> None:
         self.dialect = dialect
         self.frame_end = frame_end(dialect, self._PEER, values=values)
         super().__init__(bounds)
@@ -59,14 +59,14 @@ class ExternalRole(Wc2EcSession):
 
     kept: ClassVar[dict[str, Any]] = {"_settled_at": float}
     role = Role.HQ
-    _PEER = Sender.WC
+    _PEER = Wc2EcSender.WC
 
-    def __init__(self, dialect: Dialect) -> None:
+    def __init__(self, dialect: Wc2EcDialect) -> None:
         super().__init__(dialect)
         self._settled_at = math.inf
 
     def opened(self, now: float) -> None:
-        if self.dialect is Dialect.DRAFT:
+        if self.dialect is Wc2EcDialect.DRAFT:
             self.establish("", ())
 
     def overdue(self) -> str:
@@ -97,7 +97,7 @@ class ControllerRole(Wc2EcSession):
     """We play the Webots controller towards an external one."""
 
     role = Role.ROBOT
-    _PEER = Sender.EC
+    _PEER = Wc2EcSender.EC
 
     def opened(self, now: float) -> None:
         self.establish("", ())

@@ -14,13 +14,13 @@ import numpy as np
 
 from gateways.wc2ec.messages import (
     ChangeSensor,
-    Dialect,
     DisableSensor,
     EnableSensor,
     RegisterSensor,
     SensorData,
     SetSensor,
     SetValue,
+    Wc2EcDialect,
     Wc2EcMessage,
 )
 from gateways.wc2ec.session import ControllerRole
@@ -54,7 +54,7 @@ DEVICES = (
 )
 
 
-class Machine:
+class WebotsMachine:
     """The robot itself: what commands make it do, and what it measures. Knows no connection."""
 
     def __init__(self, seed: int) -> None:
@@ -67,7 +67,7 @@ class Machine:
         self._lift_to_m = 0.0
 
     def __repr__(self) -> str:
-        return f"<Machine {self.body} wheels {self.velocities}>"
+        return f"<WebotsMachine {self.body} wheels {self.velocities}>"
 
     def take(self, message: Wc2EcMessage) -> None:
         """Obey one command of an external controller."""
@@ -112,9 +112,9 @@ class Machine:
 class ControllerSimulator(Simulator[Wc2EcMessage]):
     """Serves one machine to the external controllers that connect."""
 
-    def __init__(self, seed: int, dialect: Dialect) -> None:
+    def __init__(self, seed: int, dialect: Wc2EcDialect) -> None:
         super().__init__(log)
-        self.machine = Machine(seed)
+        self.machine = WebotsMachine(seed)
         self._dialect = dialect
 
     def __repr__(self) -> str:
@@ -127,7 +127,7 @@ class ControllerSimulator(Simulator[Wc2EcMessage]):
 
     def greet(self, client: Conversation, link: str) -> None:
         """Register the devices, before any data."""
-        if self._dialect is Dialect.DEPLOYED:
+        if self._dialect is Wc2EcDialect.DEPLOYED:
             self.send(client, *DEVICES)
 
     def take(self, client: Conversation, message: Wc2EcMessage) -> None:
@@ -135,9 +135,9 @@ class ControllerSimulator(Simulator[Wc2EcMessage]):
 
     def step(self, steps: int) -> None:
         self.machine.step(STEP_S)
-        self.tell(*(self.machine.distances() if self._dialect is Dialect.DEPLOYED else self.machine.lights()))
+        self.tell(*(self.machine.distances() if self._dialect is Wc2EcDialect.DEPLOYED else self.machine.lights()))
 
 
 async def simulate(simulation: Simulation) -> None:
     """Run a simulated robot until cancelled."""
-    await ControllerSimulator(simulation.seed, Dialect(simulation.dialect or "deployed")).run(simulation)
+    await ControllerSimulator(simulation.seed, Wc2EcDialect(simulation.dialect or "deployed")).run(simulation)

@@ -12,30 +12,19 @@ from typing import Any, ClassVar
 
 import msgspec
 
+from gateways.wc2ec import messages
 from gateways.wc2ec.devices import (
     LIGHT,
     LINEAR,
     ROTATIONAL,
-    Table,
+    RegisteredDevices,
     WebotsDevice,
     kind_of,
     registered,
     unnamed,
 )
-from gateways.wc2ec.messages import (
-    ChangeSensor,
-    Dialect,
-    DisableSensor,
-    EnableSensor,
-    Error,
-    RegisterSensor,
-    SensorData,
-    SetSensor,
-    SetValue,
-    Wc2EcMessage,
-)
+from gateways.wc2ec.options import Wc2EcOptions
 from gateways.wc2ec.session import ExternalRole
-from gateways.wc2ec.settings import Options
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Motor, Reading, SensorSetting, Text
 from zbridge.fleet.topics import Topic
@@ -68,17 +57,17 @@ class Wc2EcRobot(Robot):
     """One Webots robot, seen from its external controller."""
 
     hands_over = True
-    kept: ClassVar[dict[str, Any]] = {"_table": Table, "_ring": BearingScan | None}
+    kept: ClassVar[dict[str, Any]] = {"_table": RegisteredDevices, "_ring": BearingScan | None}
     link_names = ("robot",)
 
-    def __init__(self, options: Options, links: int = 1, metrics: Metrics | None = None) -> None:
+    def __init__(self, options: Wc2EcOptions, links: int = 1, metrics: Metrics | None = None) -> None:
         metrics = metrics or Metrics()
         self.options = options
         self.dialect = options.dialect  # type: ignore[misc]
-        self._dialect = Dialect(options.dialect)
+        self._dialect = messages.Wc2EcDialect(options.dialect)
         self._session: ExternalRole | None = None
-        self._table = Table()
-        self._listened: set[str] = set(options.pinned)
+        self._table = RegisteredDevices()
+        self._subscribed: set[str] = set(options.pinned)
         self._ring: BearingScan | None = None
         self._tables = {name: _interpolation(table) for name, table in options.tables.items()}
         self._faults = metrics.count("sensor_faults")
@@ -93,15 +82,15 @@ class Wc2EcRobot(Robot):
     @property
     def on_demand(self) -> tuple[Topic, ...]:
         """Sensors of the draft: they measure while somebody listens."""
-        if self._dialect is Dialect.DEPLOYED:
+        if self._dialect is messages.Wc2EcDialect.DEPLOYED:
             return ()
         return tuple(topics.SENSOR(device.name) for device in self.options.devices)
 
     def session(self, link: str, peer: str) -> ExternalRole:
         self._session = ExternalRole(self._dialect)
-        self._table = Table()
+        self._table = RegisteredDevices()
         self._ring = self._new_ring()
-        for option in self.options.devices if self._dialect is Dialect.DRAFT else ():
+        for option in self.options.devices if self._dialect is messages.Wc2EcDialect.DRAFT else ():
             self._table.add(WebotsDevice(option.name, option.name, option.number, 0, option.kind))
         return self._session
 
@@ -110,10 +99,10 @@ class Wc2EcRobot(Robot):
         return BearingScan(options.bearings_deg, options.scan_range_m) if options.bearings_deg else None
 
     def begun(self, stamp_ns: int) -> tuple[Telemetry, ...]:
-        if self._dialect is Dialect.DRAFT:
+        if self._dialect is messages.Wc2EcDialect.DRAFT:
             session = self._connected()
-            devices = [device for device in map(self._table.named, sorted(self._listened)) if device is not None]
-            frames = tuple(session.encode(EnableSensor(device.type, device.number)) for device in devices)
+            devices = [device for device in map(self._table.named, sorted(self._subscribed)) if device is not None]
+            frames = tuple(session.encode(messages.EnableSensor(device.type, device.number)) for device in devices)
             if frames:
                 session.outbox.set("enable", frames, -math.inf)
             return ((topics.DEVICES, self._table.message(stamp_ns)),)
@@ -124,18 +113,18 @@ class Wc2EcRobot(Robot):
         if device is None or device.name in self.options.pinned:
             return
         if on:
-            self._listened.add(device.name)
+            self._subscribed.add(device.name)
         else:
-            self._listened.discard(device.name)
+            self._subscribed.discard(device.name)
         if self.ready:
-            self._send((EnableSensor if on else DisableSensor)(0, device.number))
+            self._send((messages.EnableSensor if on else messages.DisableSensor)(0, device.number))
 
     # Messages to telemetry
 
     def translator(self, kind: type) -> Translate:
         return partial(_TELEMETRY[kind], self)
 
-    def _registration(self, message: RegisterSensor, stamp_ns: int) -> tuple[Telemetry, ...]:
+    def _registration(self, message: messages.RegisterSensor, stamp_ns: int) -> tuple[Telemetry, ...]:
         kind = kind_of(message.kind, self._motor_types)
         device = registered(message.name, message.number, message.kind, kind)
         for motor, names in self._motor_names.items():
@@ -150,11 +139,11 @@ class Wc2EcRobot(Robot):
             shown.append((topics.TEXT, Text(text, stamp_ns=stamp_ns)))
         return tuple(shown)
 
-    def _reading(self, message: SensorData, stamp_ns: int) -> tuple[Telemetry, ...]:
+    def _reading(self, message: messages.SensorData, stamp_ns: int) -> tuple[Telemetry, ...]:
         device = self._table.numbered(message.number)
         if device is None:
             self._unregistered.value += 1
-            kind = LIGHT if self._dialect is Dialect.DRAFT else kind_of(message.kind, self._motor_types)
+            kind = LIGHT if self._dialect is messages.Wc2EcDialect.DRAFT else kind_of(message.kind, self._motor_types)
             device = unnamed(message.number, message.kind, kind)
         options, name = self.options, device.name
         value = message.value
@@ -170,7 +159,7 @@ class Wc2EcRobot(Robot):
         scan = self._ring.take(name, math.nan if fault else value, stamp_ns)
         return ((topics.SENSOR(device.name), reading), *(((topics.SCAN, scan),) if scan is not None else ()))
 
-    def _error(self, message: Error, stamp_ns: int) -> tuple[Telemetry, ...]:
+    def _error(self, message: messages.Error, stamp_ns: int) -> tuple[Telemetry, ...]:
         return ((topics.TEXT, Text(f"error of device {message.number}", stamp_ns=stamp_ns)),)
 
     # Commands to messages
@@ -189,17 +178,17 @@ class Wc2EcRobot(Robot):
 
     def stop(self, now: float, until: float) -> None:
         """Set every rotational motor to 0. Linear motors keep their position: values that wait for them are dropped."""
-        if self._dialect is Dialect.DEPLOYED:
+        if self._dialect is messages.Wc2EcDialect.DEPLOYED:
             for device in self._table.motors(LINEAR):
                 self._connected().outbox.clear(_slot(device))
             for device in self._table.motors(ROTATIONAL):
                 self._set_motor(device, 0.0, now, period_s=STOP_REPEAT_S, until=until, urgent=True)
 
     def stop_frames(self) -> tuple[bytes, ...]:
-        if self._dialect is not Dialect.DEPLOYED:
+        if self._dialect is not messages.Wc2EcDialect.DEPLOYED:
             return ()
         session, motors = self._connected(), self._table.motors(ROTATIONAL)
-        return tuple(session.encode(SetValue(device.type, device.number, 0.0)) for device in motors)
+        return tuple(session.encode(messages.SetValue(device.type, device.number, 0.0)) for device in motors)
 
     def ask(self, topic: Topic) -> None:
         raise Unsupported(f"a Webots robot cannot be asked for its {topic.path}")
@@ -238,12 +227,12 @@ class Wc2EcRobot(Robot):
         urgent: bool = False,
     ) -> None:
         """Set a motor to a value; a newer value of the same motor replaces one that still waits."""
-        if self._dialect is not Dialect.DEPLOYED:
+        if self._dialect is not messages.Wc2EcDialect.DEPLOYED:
             raise Unsupported("the draft dialect has no motors")
         if not math.isfinite(value):
             raise Malformed(f"{device.shown}: {value} is no value of a motor")
         session = self._connected()
-        frame = session.encode(SetValue(device.type, device.number, value))
+        frame = session.encode(messages.SetValue(device.type, device.number, value))
         session.outbox.set(_slot(device), (frame,), now, period_s=period_s, until=until, urgent=urgent)
 
     def _motor(self, name: str, value: float, now: float) -> None:
@@ -256,32 +245,32 @@ class Wc2EcRobot(Robot):
         device = self._table.named(name)
         if device is None:
             raise Unsupported(f"no sensor is named {name!r}")
-        if self._dialect is not Dialect.DRAFT:
+        if self._dialect is not messages.Wc2EcDialect.DRAFT:
             raise Unsupported("only the draft dialect has settings of sensors")
         header = device.type, device.number
-        messages: list[Wc2EcMessage] = []
+        changes: list[messages.Wc2EcMessage] = []
         if setting.enable is not None:
-            messages.append((EnableSensor if setting.enable else DisableSensor)(*header))
+            changes.append((messages.EnableSensor if setting.enable else messages.DisableSensor)(*header))
         if (setting.index is None) is not (setting.value is None):
             raise Malformed("index and value: one without the other")
         if setting.index is not None and setting.value is not None:
             if not 0 <= setting.index < self.options.values:
                 raise Malformed(f"index {setting.index}: expected 0 to {self.options.values - 1}")
-            messages.append(ChangeSensor(*header, setting.index, setting.value))
+            changes.append(messages.ChangeSensor(*header, setting.index, setting.value))
         if setting.values is not None:
             if len(setting.values) != self.options.values:
                 raise Malformed(f"{len(setting.values)} values: expected {self.options.values}")
             import numpy as np
 
-            messages.append(SetSensor(*header, np.array(setting.values)))
-        if not messages:
+            changes.append(messages.SetSensor(*header, np.array(setting.values)))
+        if not changes:
             raise Malformed("a setting without any field")
         if not all(map(math.isfinite, (setting.value or 0.0, *(setting.values or ())))):
             raise Malformed("a value that is no number")
-        for message in messages:
+        for message in changes:
             self._send(message)
 
-    def _send(self, message: Wc2EcMessage) -> None:
+    def _send(self, message: messages.Wc2EcMessage) -> None:
         self._connected().send(message)
 
     def _connected(self) -> ExternalRole:
@@ -295,8 +284,8 @@ def _slot(device: WebotsDevice) -> str:
     return f"motor {device.number}"
 
 
-_TELEMETRY: dict[type[Wc2EcMessage], Callable[[Wc2EcRobot, Any, int], tuple[Telemetry, ...]]] = {
-    RegisterSensor: Wc2EcRobot._registration,
-    SensorData: Wc2EcRobot._reading,
-    Error: Wc2EcRobot._error,
+_TELEMETRY: dict[type[messages.Wc2EcMessage], Callable[[Wc2EcRobot, Any, int], tuple[Telemetry, ...]]] = {
+    messages.RegisterSensor: Wc2EcRobot._registration,
+    messages.SensorData: Wc2EcRobot._reading,
+    messages.Error: Wc2EcRobot._error,
 }

@@ -31,7 +31,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gateways.alf.messages import Measurement, ScannerInit, Sender, read_text, sent_by
+from gateways.alf.messages import AlfSender, Measurement, ScannerInit, read_text, sent_by
 from gateways.alf.translate import ranges_m
 from tests.benchmarks import alf_wire
 from tests.benchmarks.alf_flow import COMMANDS_HZ, SCANS_HZ, saturated, steady
@@ -90,7 +90,7 @@ def decoding(count: int) -> list[Figure]:
     head("a text scan, 769 points, to float32 metres", "us: codec and ranges_m, np.fromstring of the same bytes, ratio")
     frame = alf_wire.scan("text", 12_345, 1_234_567)
     body = frame[2:-1]
-    ids = sent_by(Sender.VEHICLE)
+    ids = sent_by(AlfSender.VEHICLE)
     scanner = read_text(alf_wire.geometry("text"), ids)
     assert isinstance(scanner, ScannerInit)
 

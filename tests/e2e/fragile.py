@@ -24,8 +24,9 @@ from gateways.alf.conformance import parser as alf_wire
 from gateways.alf.conformance.fragile_robot import FragileVehicle
 from gateways.tcpudp.conformance import parser as tcpudp_wire
 from gateways.tcpudp.conformance.fragile_robot import FragileRobot
+from gateways.tcpudp.conformance.machine import Quirks
 from gateways.wc2ec.conformance import parser as wc2ec_wire
-from gateways.wc2ec.conformance.fragile_robot import FragileController
+from gateways.wc2ec.conformance.fragile_robot import FragileWebotsController
 from tests.e2e.processes import Part, module
 
 SEND_S = 3600.0
@@ -72,7 +73,8 @@ def package(version: str, udp: bool) -> Kind:
 
     def make(tells: bool, times: dict[str, float], **options: Any) -> FragileRobot:
         times = {"send_s": SEND_S} if tells else {"part_s": 0.2, **times}
-        robot = FragileRobot(version=version, udp=udp, times=tcpudp_wire.Times(**times), **options)
+        quirks = Quirks(**{name: options.pop(name) for name in Quirks.__struct_fields__ if name in options})
+        robot = FragileRobot(version=version, udp=udp, times=tcpudp_wire.RobotTimes(**times), quirks=quirks, **options)
         followed(robot.machine, "steer", told)
         return robot
 
@@ -87,7 +89,7 @@ def vehicle(dialect: alf_wire.Dialect) -> Kind:
     """Make an ALF vehicle; it tells the speed of 3, and 0 when its motor stops by itself."""
 
     def make(tells: bool, times: dict[str, float], **options: Any) -> FragileVehicle:
-        waits = alf_wire.Times(**{"send_s": SEND_S} if tells else {"info_s": 0.2, **times})
+        waits = alf_wire.AlfTimes(**{"send_s": SEND_S} if tells else {"info_s": 0.2, **times})
         robot = FragileVehicle(dialect, laser=True, drive=True, times=waits, **options)
         followed(robot.machine, "obey", lambda dialect, fields: fields[0] / alf_wire.FULL_PERCENT)
         followed(robot.machine, "stop", lambda: 0.0)
@@ -96,7 +98,7 @@ def vehicle(dialect: alf_wire.Dialect) -> Kind:
     return Kind(make, "alf", dialect, f'dialect = "{dialect}"\n')
 
 
-class _Controller(FragileController):
+class _Controller(FragileWebotsController):
     """Tells when it goes on after its own send held it up: it sends and reads one after the other.
 
     Once its kernel's buffer is full it waits until that kernel tries again, which nobody else can hasten.
@@ -112,12 +114,14 @@ class _Controller(FragileController):
 def controller(dialect: wc2ec_wire.Dialect, told: str) -> Kind:
     """Make a Webots controller; it tells the speed of its fastest wheel."""
 
-    def make(tells: bool, times: dict[str, float], **options: Any) -> FragileController:
-        waits = wc2ec_wire.Times(**{"send_s": SEND_S} if tells else times)
+    def make(tells: bool, times: dict[str, float], **options: Any) -> FragileWebotsController:
+        waits = wc2ec_wire.Wc2EcTimes(**{"send_s": SEND_S} if tells else times)
         made = _Controller(dialect, times=waits, **options)
 
         def fastest(_: object) -> float:
-            motors = [motor for motor in made.robot.motors.values() if motor.device.kind is wc2ec_wire.Kind.ROTATIONAL]
+            motors = [
+                motor for motor in made.robot.motors.values() if motor.device.kind is wc2ec_wire.DeviceKind.ROTATIONAL
+            ]
             return max(abs(motor.velocity) for motor in motors) * WHEEL_M / FULL_M_S
 
         followed(made.robot, "set_motor", fastest)

@@ -21,11 +21,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from gateways.alf.conformance.fragile_hq import FragileHq as AlfHq
+from gateways.alf.conformance.fragile_hq import FragileAlfHq
 from gateways.alf.conformance.parser import Dialect
-from gateways.tcpudp.conformance.fragile_hq import FragileHq as TcpHq
-from gateways.tcpudp.conformance.parser import Feature
-from gateways.wc2ec.conformance.fragile_hq import FragileController
+from gateways.tcpudp.conformance.fragile_hq import FragileTcpUdpHq
+from gateways.tcpudp.conformance.parser import FeatureFlag
+from gateways.wc2ec.conformance.fragile_hq import FragileExternalController
 from tests.e2e import mixed
 from tests.e2e.conftest import HOST, Bench, Gateway, device, listener
 from tests.e2e.fragile import DISTURBED, Fragile, charges, disturbed, fragile_robot
@@ -98,7 +98,7 @@ class Tcp(Program):
     def __init__(self, version: str, *, udp: bool) -> None:
         self.name = f"tcp{version}"
         port = free_port()  # each binds one of its own, as if it had a machine of its own
-        self.judge = TcpHq(version=version, udp=udp, lidar_sim=version != "1.1", udp_port=port)
+        self.judge = FragileTcpUdpHq(version=version, udp=udp, lidar_sim=version != "1.1", udp_port=port)
         listed = '"1.1", "1.2", "1.3"' if version == "1.3" else f'"{version}"'
         self.options = f"options = {{ versions = [{listed}], client_port = {port} }}"
 
@@ -130,7 +130,7 @@ class Tcp(Program):
         judge = self.judge
         if robot.startswith("tcpudp"):
             return judge.position is not None and bool(judge.map)
-        return judge.settings is not None and judge.settings.features >= {Feature.JOYSTICK}
+        return judge.settings is not None and judge.settings.features >= {FeatureFlag.JOYSTICK}
 
 
 class Alf(Program):
@@ -140,7 +140,7 @@ class Alf(Program):
 
     def __init__(self, dialect: Dialect, *, scans: bool = False) -> None:
         self.name = "alf-scans" if scans else f"alf-{dialect}"
-        self.judge = AlfHq(dialect=dialect, deployed="scanning" if scans else "driving")
+        self.judge = FragileAlfHq(dialect=dialect, deployed="scanning" if scans else "driving")
         self.options = f'options = {{ dialect = "{dialect}" }}'
         self._scans, self._full = scans, ALF_FULL[dialect]
 
@@ -171,7 +171,7 @@ class Ec(Program):
     """On a busy machine its two wheels are further apart than elsewhere."""
 
     def __init__(self) -> None:
-        self.judge = FragileController(split=True)
+        self.judge = FragileExternalController(split=True)
         self._forward, self._setting = 0.0, asyncio.Lock()
 
     @property

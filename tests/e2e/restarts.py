@@ -183,7 +183,7 @@ class Controller(Numbered):
 
     def __init__(self) -> None:
         super().__init__()
-        self._reader = wc2ec.Reader("deployed", self.devices, 0)
+        self._reader = wc2ec.ExternalReader("deployed", self.devices, 0)
         self._wheels: dict[int, Any] = {}
 
     def message(self, number: int) -> bytes:

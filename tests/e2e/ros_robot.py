@@ -124,7 +124,7 @@ class Scene:
         until(lambda: not any(robot.velocity), 30, "the robot is at rest")
         ends = time.monotonic() + quiet_s
         until(lambda: time.monotonic() > ends, what="a while")
-        told = list(robot.told)
+        told = list(robot.commands)
         last = max((number for number, one in enumerate(told) if one.moves), default=-1)
         assert last + 1 < len(told), "the robot's last command is motion"
         return max(0.0, told[last + 1].at - at)
@@ -185,8 +185,8 @@ def _other(scene: Scene) -> float:
         scene.bench.fleet.put("r1/@cmd/stop")
         at = time.monotonic()
         until(lambda: time.monotonic() > at + 1.0, what="a while")
-        told = [one for one in list(scene.robot.told) if one.at > at]
-    after = [one for one in list(scene.robot.told) if one.at > at]
+        told = [one for one in list(scene.robot.commands) if one.at > at]
+    after = [one for one in list(scene.robot.commands) if one.at > at]
     assert any(one.gid == other.gid for one in told), "the other said nothing"
     longest = 0.0
     for one, following in pairwise(after):

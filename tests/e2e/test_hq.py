@@ -11,9 +11,9 @@ import time
 
 import pytest
 
-from gateways.alf.conformance.fragile_hq import FragileHq as AlfHq
-from gateways.tcpudp.conformance.fragile_hq import FragileHq as TcpHq
-from gateways.wc2ec.conformance.fragile_hq import FragileController
+from gateways.alf.conformance.fragile_hq import FragileAlfHq
+from gateways.tcpudp.conformance.fragile_hq import FragileTcpUdpHq
+from gateways.wc2ec.conformance.fragile_hq import FragileExternalController
 from tests.e2e.conftest import HOST, Bench, device, listener
 from tests.e2e.fragile import charges
 from tests.e2e.hq_churn import churn
@@ -58,7 +58,7 @@ async def test_a_process_without_a_robot_tells_its_programs_when_the_robot_comes
     parts = [listener("tcp", "tcpudp", tcp), listener("alf", "alf", alf), listener("ec", "wc2ec", ec)]
     hq, simulated = bench.gateway(*parts, name="hq"), device(bench.simulator())
     await soon(lambda: hq.listens(3), "listeners")
-    program, vehicle, controller = TcpHq(), AlfHq(), FragileController()
+    program, vehicle, controller = FragileTcpUdpHq(), FragileAlfHq(), FragileExternalController()
 
     async def told(what: str) -> None:
         await soon(lambda: any(what in text for text in program.texts), f"told: {what}")
@@ -136,7 +136,7 @@ async def test_programs_that_behave_badly_cost_a_good_one_nothing_and_are_closed
     process = bench.gateway(listener("hq", "tcpudp", port, limits), device(feed.robot.port))
     await soon(lambda: process.listens(1) and bench.fleet.state() == "established", "established")
     feed.start()
-    good = TcpHq(udp=False)
+    good = FragileTcpUdpHq(udp=False)
     async with playing(good.run(HOST, port)):
         await soon(lambda: good.position, "position")
         began, withheld_s = time.monotonic(), bench.withheld_s

@@ -9,7 +9,7 @@ from typing import Any
 
 import msgpack
 
-from gateways.tcpudp.conformance.fragile_hq import FragileHq
+from gateways.tcpudp.conformance.fragile_hq import FragileTcpUdpHq
 from tests.e2e.conftest import HOST, Bench, ask, device, end, listener, start, until
 from tests.e2e.hq_scene import playing, soon
 from tests.e2e.restarts import Restarted
@@ -104,7 +104,7 @@ def test_what_no_gateway_confirmed_is_said_and_a_gateway_that_was_frozen_is_latc
     assert refused(bench, "r2")
 
 
-def refused_with(program: FragileHq, reason: str) -> bool:
+def refused_with(program: FragileTcpUdpHq, reason: str) -> bool:
     """Let a program try to drive, neutral first: its gateway may have been frozen; whether it was told the reason."""
     program.idle()
     program.move(0.0, 1.0, 0.5)
@@ -116,7 +116,7 @@ async def test_an_old_hq_program_is_told_who_latched_the_robot_and_drives_after_
     gateway = bench.gateway(device(bench.simulator()), listener("tcp", "tcpudp", port))
     await soon(lambda: gateway.listens(1), "a listener")
     await soon(lambda: bench.fleet.state() == "established", "established")
-    program = FragileHq()
+    program = FragileTcpUdpHq()
     async with playing(program.run(HOST, port)):
         await soon(lambda: program.position, "a position")
         program.mode(2)

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from gateways.alf.conformance.fragile_hq import FragileHq as AlfHq
-from gateways.tcpudp.conformance.fragile_hq import FragileHq as TcpHq
-from gateways.wc2ec.conformance.fragile_hq import FragileController
+from gateways.alf.conformance.fragile_hq import FragileAlfHq
+from gateways.tcpudp.conformance.fragile_hq import FragileTcpUdpHq
+from gateways.wc2ec.conformance.fragile_hq import FragileExternalController
 from tests.e2e.conftest import HOST, Bench, device, listener
 from tests.e2e.fragile import charges
 from tests.e2e.hq_judge import LET_GO_S
@@ -84,7 +84,7 @@ async def test_programs_of_every_protocol_drive_a_robot_of_a_protocol_that_their
     tcp, alf, ec = ports(3)
     parts = [listener("tcp", "tcpudp", tcp), listener("alf", "alf", alf), listener("ec", "wc2ec", ec)]
     process = bench.gateway(*parts, device(bench.simulator("toy"), "toy"), "[control]\nlease_s = 1.2\n")
-    program, vehicle, controller = TcpHq(), AlfHq(deployed="driving"), FragileController()
+    program, vehicle, controller = FragileTcpUdpHq(), FragileAlfHq(deployed="driving"), FragileExternalController()
     await soon(lambda: process.listens(3), "listeners")
     await soon(lambda: bench.fleet.state() == "established", "established")
 

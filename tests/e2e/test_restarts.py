@@ -9,9 +9,9 @@ import time
 
 import pytest
 
-from gateways.alf.conformance.fragile_hq import FragileHq as AlfHq
-from gateways.tcpudp.conformance.fragile_hq import FragileHq as TcpHq
-from gateways.wc2ec.conformance.fragile_hq import FragileController
+from gateways.alf.conformance.fragile_hq import FragileAlfHq
+from gateways.tcpudp.conformance.fragile_hq import FragileTcpUdpHq
+from gateways.wc2ec.conformance.fragile_hq import FragileExternalController
 from tests.e2e.conftest import HOST, Bench, device, listener, start, until
 from tests.e2e.fragile import Fragile, charges
 from tests.e2e.hq_scene import playing, ports, soon
@@ -61,7 +61,7 @@ async def test_old_hq_programs_stay_connected_and_drive_again_after_neutral(benc
     gateway = Restarted(bench, bench.gateway(device(bench.simulator()), *parts))
     await soon(lambda: gateway.gateway.listens(3), "listeners")
     await soon(lambda: bench.fleet.state() == "established", "established")
-    program, vehicle, controller = TcpHq(), AlfHq(), FragileController()
+    program, vehicle, controller = FragileTcpUdpHq(), FragileAlfHq(), FragileExternalController()
 
     async def drives() -> None:
         before = bench.fleet.last("r1/pose")

@@ -87,7 +87,7 @@ def test_a_robot_in_a_namespace_that_takes_stamped_twists_on_a_clock_of_its_own(
     time.sleep(0.2)  # commands from before the change are on their way
     robot.violations.clear()
     with scene.driven():
-        until(lambda: len([one for one in robot.told if one.moves]) > 5, what="repeated commands")
+        until(lambda: len([one for one in robot.commands if one.moves]) > 5, what="repeated commands")
     assert robot.violations == []
 
 

@@ -231,7 +231,7 @@ _ALF = ("gateways/alf/session.py", "gateways/alf/translate.py", "gateways/alf/hq
 _WC2EC = ("gateways/wc2ec/session.py", "gateways/wc2ec/devices.py", "gateways/wc2ec/translate.py")
 _TCPUDP = ("gateways/tcpudp/session/robot_role.py", "gateways/tcpudp/session/hq_role.py",
            "gateways/tcpudp/session/hq_handshake.py", "gateways/tcpudp/settings.py",
-           "gateways/tcpudp/translate/telemetry.py", "gateways/tcpudp/hq/commands.py")  # fmt: skip
+           "gateways/tcpudp/telemetry.py", "gateways/tcpudp/hq_client.py")  # fmt: skip
 ROLES: tuple[tuple[str, Make, tuple[str, ...], bytes], ...] = (
     ("session-alf-robot-text", _robot(ALF, points=3), _ALF, stream("alf-laser.hex", source=16667)),
     ("session-alf-robot-scanner", _robot(ALF, points_from_scanner=True), _ALF, stream("alf-laser.hex", source=16667)),

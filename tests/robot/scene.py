@@ -25,7 +25,8 @@ from typing import Any
 
 import msgpack
 
-from gateways.tcpudp.translate import Options, TcpUdpRobot
+from gateways.tcpudp.options import TcpUdpOptions
+from gateways.tcpudp.translate import TcpUdpRobot
 from tests.clock import JumpingLoop
 from tests.proofs import Holder, numbered, packed
 from zbridge.bus import Handle, IncomingQuery, Lane, Sample
@@ -183,7 +184,7 @@ class Rig:
         self.settings = SETTINGS
         self.audit_lines: list[str] = []
         self.device = Device(
-            TcpUdpRobot(Options()),
+            TcpUdpRobot(TcpUdpOptions()),
             (ADDRESS,),
             protocol="tcpudp",
             keys=KeySpace("fleet", "r1"),

@@ -11,7 +11,8 @@ from typing import Any
 
 import pytest
 
-from gateways.tcpudp.translate import Options, TcpUdpRobot
+from gateways.tcpudp.options import TcpUdpOptions
+from gateways.tcpudp.translate import TcpUdpRobot
 from tests.robot.scene import SETTINGS, STOP, Rig, established, serving
 from zbridge.control.latch import Latches, LatchRecord
 from zbridge.robot.commands import WRITE_S
@@ -152,11 +153,11 @@ async def test_another_gateway_says_so_the_robot_is_stopped_at_once_unless_it_is
 
 
 def test_a_robot_that_may_move_by_itself_is_stopped_so_from_its_first_connection_on() -> None:
-    robot = TcpUdpRobot(Options())
+    robot = TcpUdpRobot(TcpUdpOptions())
     assert not robot.session("robot", "peer").sent_autonomous
     robot.was_autonomous()
     assert robot.session("robot", "peer").sent_autonomous
-    fresh = TcpUdpRobot(Options())
+    fresh = TcpUdpRobot(TcpUdpOptions())
     fresh.was_autonomous()
     assert fresh.session("robot", "peer").sent_autonomous
 

@@ -24,7 +24,7 @@ OWNERSHIP = "zbridge/robot/ownership.py"
 COMMANDS = "zbridge/robot/commands.py"
 DEVICE = "zbridge/robot/device.py"
 STANDSTILL = "zbridge/control/standstill.py"
-TCPUDP = "gateways/tcpudp/translate/robot.py"
+TCPUDP = "gateways/tcpudp/translate.py"
 PRESENCE = "zbridge/robot/presence.py"
 
 MUTANTS = (
@@ -218,8 +218,8 @@ MUTANTS = (
         "stop does not end mode 3",
         "tcpudp",
         TCPUDP,
-        "return (ClientControllMode(mode), ClientJoystickStop()) if paired",
-        "return (ClientJoystickStop(),) if paired",
+        "return (packets.ClientControllMode(mode), stop) if paired",
+        "return (stop,) if paired",
     ),
     Mutant("neutral does not reach the robot", None, TCPUDP, "            self._neutral(session, now)\n", ""),
     Mutant(

@@ -13,7 +13,9 @@ import socket
 import sys
 from abc import abstractmethod
 from collections.abc import Callable, Coroutine, Iterable
-from typing import Any, Unpack
+from typing import Any, Protocol, Unpack
+
+import msgspec
 
 from zbridge.simulation.judge import Bounds, Ended, Judge, MessageReader
 from zbridge.simulation.sockets import bind_tcp, send_at_once
@@ -130,6 +132,16 @@ class FragilePeer(Judge):
                 self._conn.shutdown(how)
 
 
+class Simulated(Protocol):
+    """How a simulated robot is started: ``addresses`` to listen at; ``ready`` is called with those that are bound."""
+
+    @property
+    def addresses(self) -> tuple[Any, ...]: ...
+
+    @property
+    def ready(self) -> Callable[[tuple[Any, ...]], None]: ...
+
+
 class FragileServer(FragilePeer):
     """A robot that serves one connection per start; it accepts every later one and never answers it.
 
@@ -145,6 +157,33 @@ class FragileServer(FragilePeer):
                 await self._run(self._accept(server, sockets))
         finally:
             self._over.set()
+
+    async def simulate(self, simulation: Simulated, *others: FragileServer) -> None:
+        """Serve the first address of a simulation, ``others`` the next ones, until cancelled, dead or left.
+
+        Log each violation, and print why each server ended. Raise OSError for an address that is taken.
+        """
+        addresses = dict(zip((self, *others), simulation.addresses, strict=True))
+        ports: dict[FragileServer, int] = {}
+
+        async def serve(server: FragileServer) -> None:
+            def ready(port: int) -> None:
+                ports[server] = port
+                if len(ports) == len(addresses):
+                    bound = (msgspec.structs.replace(at, port=ports[one]) for one, at in addresses.items())
+                    simulation.ready(tuple(bound))
+
+            server._note = server._note or log_violations()
+            await server.serve(addresses[server].host, addresses[server].port, ready)
+            if server.ending:
+                print_line(server.ending)
+
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                for server in addresses:
+                    tasks.create_task(serve(server))
+        except ExceptionGroup as errors:
+            raise errors.exceptions[0] from None
 
     @abstractmethod
     def _begin(self, conn: socket.socket) -> None:
@@ -174,13 +213,6 @@ class FragileServer(FragilePeer):
             for old in unanswered[:-_UNANSWERED]:
                 old.close()
             del unanswered[:-_UNANSWERED]
-
-
-async def simulate(robot: FragileServer, host: str, port: int, ready: Callable[[int], None]) -> None:
-    """Run a robot until cancelled, dead or left; print why it ended."""
-    await robot.serve(host, port, ready)
-    if robot.ending:
-        print_line(robot.ending)
 
 
 def log_violations(name: str = "") -> Callable[[str], None]:

@@ -11,7 +11,7 @@ from abc import abstractmethod
 from collections.abc import Iterable
 from typing import ClassVar, Unpack
 
-from zbridge.simulation.fragile import FragilePeer, print_line
+from zbridge.simulation.fragile import FragilePeer, log_violations, print_line
 from zbridge.simulation.judge import Bounds
 from zbridge.simulation.sockets import connected
 
@@ -48,6 +48,11 @@ class HqProgram(FragilePeer):
         finally:
             self._conn = None
             self._over.set()
+
+    async def simulate(self, host: str, port: int, drive: tuple[float, float] | None) -> None:
+        """Run as :func:`run_hq_program` does, and log each violation."""
+        self._note = self._note or log_violations()
+        await run_hq_program(self, host, port, drive)
 
     async def _read(self) -> None:
         """Read once and judge it, or the end of the connection."""

@@ -11,9 +11,20 @@ from collections.abc import Iterable
 from typing import Literal, NamedTuple, NoReturn, Unpack
 
 from gateways.alf.conformance import parser as wire
-from gateways.alf.conformance.parser import END, INFO, INIT, SCAN, Dialect, Fields, Message, Phase, VehicleReader, show
-from zbridge.simulation.fragile import Work, log_violations
-from zbridge.simulation.hq_program import HqProgram, run_hq_program
+from gateways.alf.conformance.parser import (
+    END,
+    INFO,
+    INIT,
+    SCAN,
+    Dialect,
+    Fields,
+    ParsedAlfMessage,
+    Phase,
+    VehicleReader,
+    show,
+)
+from zbridge.simulation.fragile import Work
+from zbridge.simulation.hq_program import HqProgram
 from zbridge.simulation.judge import Bounds, Ended
 from zbridge.simulation.timing import Ticker
 
@@ -29,7 +40,7 @@ FULL = {"text": 255, "binary": 100}
 """The speed that is full speed."""
 
 
-class Scan(NamedTuple):
+class LastScan(NamedTuple):
     """The last measurement, as it was sent: points in mm, valid indices inclusive."""
 
     sequence: int
@@ -39,7 +50,7 @@ class Scan(NamedTuple):
     last: int
 
 
-class FragileHq(HqProgram):
+class FragileAlfHq(HqProgram):
     """One connection of an operator program: records every violation and dies of what breaks it.
 
     ``points``: of every measurement; ``serves``: what the listener is configured to serve; ``deployed``: be the
@@ -74,7 +85,7 @@ class FragileHq(HqProgram):
         self.scanner: Fields | None = None
         """The last message 2."""
         self.scans = 0
-        self.last_scan: Scan | None = None
+        self.last_scan: LastScan | None = None
         self.infos: deque[Fields] = self._rows()
         """Every message 4."""
         self._serves: Serves = serves
@@ -185,7 +196,7 @@ class FragileHq(HqProgram):
 
     # Messages of the vehicle
 
-    def _receive(self, message: Message) -> None:
+    def _receive(self, message: ParsedAlfMessage) -> None:
         if self._stopped:
             return None
         kind, whole = message.kind, self._reader.whole(message)
@@ -214,7 +225,7 @@ class FragileHq(HqProgram):
         since_s = time.monotonic() - self._drove_at
         return _SERVED["laser" if since_s < 0 else "both" if since_s < self._flight_s else "drive"]
 
-    def _show(self, message: Message) -> None:
+    def _show(self, message: ParsedAlfMessage) -> None:
         """Take a message of the right length ("Send the cached 2 first, then 1 and 4 as they come")."""
         if message.kind == INIT:
             if self.scanner is not None:
@@ -226,7 +237,7 @@ class FragileHq(HqProgram):
             if self.scanner is None and not self.scans:
                 self._violate("a measurement before the scanner init")
             sequence, stamp, *points, first, last = map(int, message.fields)
-            self.scans, self.last_scan = self.scans + 1, Scan(sequence, stamp, tuple(points), first, last)
+            self.scans, self.last_scan = self.scans + 1, LastScan(sequence, stamp, tuple(points), first, last)
             if self.scans == self._stops_after:
                 self._stopped = True
                 self._event(f"it reads no more, after {self.scans} measurements")
@@ -260,25 +271,3 @@ class FragileHq(HqProgram):
     def _send_end(self) -> None:
         if not self._midway:
             self._write_now(wire.end(self.dialect))
-
-
-async def simulate_fragile_hq(
-    host: str,
-    port: int,
-    *,
-    dialect: Dialect,
-    points: int = wire.POINTS,
-    drive: tuple[float, float] | None = None,
-) -> None:
-    """Run the fragile driving HQ until cancelled, dead or left by the vehicle; log violations, print what it does.
-
-    drive: forward and turn, fractions of full scale; None: its stick stays centred. Raise OSError if nobody listens.
-    """
-    hq = FragileHq(
-        dialect=dialect,
-        points=points,
-        serves="both",  # what the listener is configured to serve is not known here
-        deployed="driving",
-        note=log_violations(),
-    )
-    await run_hq_program(hq, host, port, drive)

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import asyncio
 import socket
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from functools import partial
 from typing import Unpack
 
 from gateways.alf.conformance import parser as wire
-from gateways.alf.conformance.machine import Machine
-from gateways.alf.conformance.parser import Dialect, Fields, Message, Phase, Repeats, Times, show
-from zbridge.simulation.fragile import FragileServer, Work, log_violations, simulate
+from gateways.alf.conformance.machine import JudgedVehicle
+from gateways.alf.conformance.parser import AlfTimes, Dialect, Fields, ParsedAlfMessage, Phase, Repeats, show
+from zbridge.simulation.fragile import FragileServer, Work, log_violations
 from zbridge.simulation.judge import Bounds, Chances
 from zbridge.simulation.sockets import drain, reset_on_close
 from zbridge.simulation.timing import Ticker
 
 _MOST_MOVE_S = 0.1
 """Longest time for which the vehicle moves in one cycle, however late it is."""
-_DEPLOYED = Times()
+_DEPLOYED = AlfTimes()
 
 
 class FragileVehicle(FragileServer):
@@ -41,8 +40,8 @@ class FragileVehicle(FragileServer):
         drive: bool,
         points: int = wire.POINTS,
         seed: int = 1,
-        times: Times = _DEPLOYED,
-        machine: Machine | None = None,
+        times: AlfTimes = _DEPLOYED,
+        machine: JudgedVehicle | None = None,
         **bounds: Unpack[Bounds],
     ) -> None:
         if not (laser or drive) or dialect not in ("text", "binary"):
@@ -51,7 +50,7 @@ class FragileVehicle(FragileServer):
         self.dialect: Dialect = dialect
         self.laser, self.drive = laser, drive
         chance = Chances(seed)
-        self.machine = machine or Machine(chance["machine"], points)
+        self.machine = machine or JudgedVehicle(chance["machine"], points)
         self._times, self._repeats = times, Repeats(times)
         self._reader = wire.reader(dialect, {wire.DRIVE, wire.END} if drive else {wire.END}, wire.FULL_PERCENT)
         self._phase = Phase.WAITING
@@ -141,7 +140,7 @@ class FragileVehicle(FragileServer):
 
     # Messages of the HQ
 
-    def _receive(self, message: Message) -> None:
+    def _receive(self, message: ParsedAlfMessage) -> None:
         self.received.append((time.monotonic(), message.kind, message.fields))
         raw = show(message.raw, self.dialect)
         if self._phase is Phase.CLOSING:
@@ -155,7 +154,7 @@ class FragileVehicle(FragileServer):
             self._violate(f"a message {self._waited_s:.2f} s after the vehicle's END: {raw}")
         return None
 
-    def _obey(self, message: Message) -> None:
+    def _obey(self, message: ParsedAlfMessage) -> None:
         """Take a command; apply the last one again on any message ("The gateway as HQ": stale commands)."""
         if message.kind == wire.DRIVE and self._reader.whole(message):
             speed = message.fields[0]
@@ -233,36 +232,10 @@ class FragileVehicle(FragileServer):
                     self._finish(f"the HQ read nothing for {self._times.send_s:g} s")
 
 
-async def simulate_fragile(
-    host: str,
-    port: int,
-    *,
-    dialect: Dialect,
-    laser_port: int | None,
-    seed: int,
-    ready: Callable[[int, int | None], None],
-    times: Times = _DEPLOYED,
-    points: int = wire.POINTS,
-) -> None:
-    """Run a fragile vehicle until cancelled or dead; log each violation, and print what it died of.
-
-    Without ``laser_port`` one server does everything; with it (0: any) ``port`` drives and ``laser_port`` measures.
-    ``ready`` is called with both ports once both listen.
-    """
-    one = laser_port is None
+def fragile_vehicle(dialect: Dialect, *, servers: int, seed: int, times: AlfTimes = _DEPLOYED) -> list[FragileVehicle]:
+    """Make the servers of one vehicle: one for everything, or one that drives and one that measures ("Roles")."""
     server = partial(FragileVehicle, dialect, seed=seed, times=times)
-    drive = server(laser=one, drive=True, points=points, note=log_violations("vehicle" if one else "drive"))
-    if laser_port is None:
-        return await simulate(drive, host, port, lambda number: ready(number, None))
-    laser = server(laser=True, drive=False, machine=drive.machine, note=log_violations("laser"))
-    ports: dict[str, int] = {}
-
-    def listening(name: str, number: int) -> None:
-        ports[name] = number
-        if len(ports) == 2:
-            ready(ports["drive"], ports["laser"])
-
-    async with asyncio.TaskGroup() as tasks:
-        tasks.create_task(simulate(drive, host, port, lambda number: listening("drive", number)))
-        tasks.create_task(simulate(laser, host, laser_port, lambda number: listening("laser", number)))
-    return None
+    if servers == 1:
+        return [server(laser=True, drive=True, note=log_violations("vehicle"))]
+    drive = server(laser=False, drive=True, note=log_violations("drive"))
+    return [drive, server(laser=True, drive=False, machine=drive.machine, note=log_violations("laser"))]

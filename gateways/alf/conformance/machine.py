@@ -20,7 +20,7 @@ _COUNTS_PER_G, _COUNTS_PER_DEG_S = 1000.0, 10.0
 """Of message 4 in ``binary`` ("Scale of accelerations and gyro")."""
 
 
-class Machine:
+class JudgedVehicle:
     """One vehicle, at a seeded place; ``points``: of a measurement."""
 
     def __init__(self, random: Random, points: int = POINTS) -> None:

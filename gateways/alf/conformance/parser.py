@@ -55,10 +55,10 @@ class Phase(enum.Enum):
     OVER = enum.auto()
 
 
-class Times(msgspec.Struct, frozen=True, kw_only=True):
+class AlfTimes(msgspec.Struct, frozen=True, kw_only=True):
     """The vehicle's times in seconds, and how patient the judge is.
 
-    What the judge waits for is timed by its own clock, which stands still while its process is late.
+    What the judge waits for is timed by its own clock, which stops while its process is late.
     """
 
     cycle_s: float = 0.02
@@ -84,7 +84,7 @@ class Times(msgspec.Struct, frozen=True, kw_only=True):
     """Longest time one message may take to send."""
 
 
-class Message(msgspec.Struct, frozen=True):
+class ParsedAlfMessage(msgspec.Struct, frozen=True):
     """One message of the peer: its id and fields, what is wrong with it, and whether the judge dies of it."""
 
     kind: int
@@ -120,7 +120,7 @@ def reader(dialect: Dialect, ids: Collection[int], speed_full: int) -> CommandRe
     return CommandReader(dialect, ids, speed_full)
 
 
-class _Reader(MessageReader[Message]):
+class _AlfReader(MessageReader[ParsedAlfMessage]):
     """Cuts the stream of a peer in either dialect. ``counts``: of the fields, by the id of a known message."""
 
     _unknown: str
@@ -130,7 +130,7 @@ class _Reader(MessageReader[Message]):
         self._dialect, self._counts, self._longest = dialect, counts, longest
         self._layouts = {kind: _layout(kind, count) for kind, count in counts.items()}
 
-    def take(self, data: bytes) -> list[Message]:
+    def take(self, data: bytes) -> list[ParsedAlfMessage]:
         """Read the messages that end in ``data``."""
         if self._dialect == "binary":
             return super().take(data)
@@ -138,36 +138,36 @@ class _Reader(MessageReader[Message]):
         messages = [self._read_text(text + b";") for text in texts]
         if len(self.rest) > self._longest:
             problem = f"a message without end, {len(self.rest)} bytes"
-            messages.append(Message(NO_ID, (), self.rest, problem, deadly=True))
+            messages.append(ParsedAlfMessage(NO_ID, (), self.rest, problem, deadly=True))
         return messages
 
-    def whole(self, message: Message) -> bool:
+    def whole(self, message: ParsedAlfMessage) -> bool:
         """Tell whether a message has as many fields as its id has, valid or not."""
         return len(message.fields) == self._counts.get(message.kind)
 
     def _lost(self, data: bytes) -> str:
         return "" if data[0] in self._counts else f"id {data[0]}, {self._unknown}: the framing is lost"
 
-    def _lose(self, problem: str, after: int) -> Message:
+    def _lose(self, problem: str, after: int) -> ParsedAlfMessage:
         self.dead = True
-        return Message(self.rest[0], (), self.rest, problem, deadly=True)
+        return ParsedAlfMessage(self.rest[0], (), self.rest, problem, deadly=True)
 
     def _size(self, data: bytes) -> int:
         return self._layouts[data[0]].size
 
-    def _read(self, raw: bytes) -> Message:
+    def _read(self, raw: bytes) -> ParsedAlfMessage:
         kind, *fields = self._layouts[raw[0]].unpack(raw)
         return self._judge(kind, tuple(fields), raw)
 
-    def _read_text(self, raw: bytes) -> Message:
+    def _read_text(self, raw: bytes) -> ParsedAlfMessage:
         """Read a message as deployed readers do: every number is a field, all else separates ("Dialect `text`")."""
         raise NotImplementedError
 
-    def _judge(self, kind: int, fields: Fields, raw: bytes) -> Message:
+    def _judge(self, kind: int, fields: Fields, raw: bytes) -> ParsedAlfMessage:
         raise NotImplementedError
 
 
-class CommandReader(_Reader):
+class CommandReader(_AlfReader):
     """Cuts and judges the stream of an HQ, for a server that knows the messages ``ids``."""
 
     _unknown = "of which this server knows nothing"
@@ -177,15 +177,15 @@ class CommandReader(_Reader):
         speeds = (0, speed_full if dialect == "text" else 255)
         self._bounds = {DRIVE: (speeds, (0, 1), ANGLES[dialect], (0, 1)), END: ((1, 1),)}
 
-    def _read_text(self, raw: bytes) -> Message:
+    def _read_text(self, raw: bytes) -> ParsedAlfMessage:
         numbers = NUMBER.findall(raw.decode("latin-1"))
         problem = next(filter(None, map(deadly, numbers)), "")
         if problem or not numbers:
-            return Message(NO_ID, (), raw, problem or "a message without a number", deadly=bool(problem))
+            return ParsedAlfMessage(NO_ID, (), raw, problem or "a message without a number", deadly=bool(problem))
         kind, *fields = map(integer, numbers)
         return self._judge(kind, tuple(fields), raw)
 
-    def _judge(self, kind: int, fields: Fields, raw: bytes) -> Message:
+    def _judge(self, kind: int, fields: Fields, raw: bytes) -> ParsedAlfMessage:
         if self._dialect == "text" and not INTEGERS.fullmatch(raw):
             problem = "not written as std::to_string prints integers"
         elif kind not in self._counts:
@@ -194,7 +194,7 @@ class CommandReader(_Reader):
             problem = f"{len(fields)} fields instead of {self._counts[kind]}"
         else:
             problem = self._out_of_bounds(kind, fields)
-        return Message(kind, fields, raw, problem)
+        return ParsedAlfMessage(kind, fields, raw, problem)
 
     def _out_of_bounds(self, kind: int, fields: Fields) -> str:
         names = _DRIVE_FIELDS if kind == DRIVE else ("end",)
@@ -204,8 +204,8 @@ class CommandReader(_Reader):
         return ""
 
 
-class VehicleReader(_Reader):
-    """Cuts and judges the stream of a vehicle; ``points``: of a measurement, which nothing on the wire tells."""
+class VehicleReader(_AlfReader):
+    """Cuts and judges the stream of a vehicle; ``points``: of a measurement, which is not on the wire."""
 
     _unknown = "which no vehicle sends"
 
@@ -214,22 +214,22 @@ class VehicleReader(_Reader):
         super().__init__(dialect, counts, max(LONGEST_BYTES, 2 * _LONGEST_NUMBER * counts[SCAN]))
         self._points = points
 
-    def _read_text(self, raw: bytes) -> Message:
+    def _read_text(self, raw: bytes) -> ParsedAlfMessage:
         first, *numbers = NUMBER.findall(raw.decode("latin-1")) or [str(NO_ID)]
         if first == str(NO_ID):
-            return Message(NO_ID, (), raw, "a message without an id")
+            return ParsedAlfMessage(NO_ID, (), raw, "a message without an id")
         kind = NO_ID if deadly(first) else integer(first)
         is_float = [at in _FLOATS.get(kind, ()) for at in range(len(numbers))]
         breaks = ["NaN" if b"nan" in raw.lower() else "", deadly(first), *map(_breaks, numbers, is_float)]
         if problem := next(filter(None, breaks), ""):
-            return Message(kind, (), raw, problem, deadly=True)
+            return ParsedAlfMessage(kind, (), raw, problem, deadly=True)
         fields = (float(number) if real else integer(number) for number, real in zip(numbers, is_float, strict=True))
         return self._judge(kind, tuple(fields), raw)
 
-    def _judge(self, kind: int, fields: Fields, raw: bytes) -> Message:
+    def _judge(self, kind: int, fields: Fields, raw: bytes) -> ParsedAlfMessage:
         """Judge a message by its fields ("The gateway as vehicle": what they break on; "Dialect ...")."""
         if breaks := self._deadly(kind, fields):
-            return Message(kind, fields, raw, breaks, deadly=True)
+            return ParsedAlfMessage(kind, fields, raw, breaks, deadly=True)
         if kind not in self._counts:
             problem = f"id {kind}, {self._unknown}"
         elif len(fields) != self._counts[kind]:
@@ -238,7 +238,7 @@ class VehicleReader(_Reader):
             problem = "not written as std::to_string prints numbers"
         else:
             problem = self._wrong(kind, fields)
-        return Message(kind, fields, raw, problem)
+        return ParsedAlfMessage(kind, fields, raw, problem)
 
     def _deadly(self, kind: int, fields: Fields) -> str:
         if kind == SCAN and len(fields) > self._counts[SCAN]:
@@ -271,9 +271,9 @@ def _breaks(number: str, is_float: bool) -> str:
 
 
 class Repeats:
-    """The rhythm of the commands ("The gateway as HQ": repeats every 20 ms for as long as the link stands)."""
+    """The rhythm of the commands ("The gateway as HQ": repeats every 20 ms for as long as the link is up)."""
 
-    def __init__(self, times: Times) -> None:
+    def __init__(self, times: AlfTimes) -> None:
         self._times, self._limit_s = times, times.first_s
         self._silent_s, self._noted = 0.0, False
         self._window_s, self._commands = 0.0, 0

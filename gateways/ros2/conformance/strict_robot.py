@@ -42,7 +42,7 @@ SKIPS = 5
 """Numbers that may go up at once: Zenoh drops commands between ROS nodes too, where a router is late by 20 ms."""
 
 
-class Command(NamedTuple):
+class JudgedCommand(NamedTuple):
     """One command: when it came, from which gid, m/s forward and to the left, rad/s."""
 
     at: float
@@ -74,12 +74,12 @@ def gid_of(token: str) -> bytes:
 
 
 class StrictRobot(Judge):
-    """The robot. namespace: with ``/`` first, or empty; stamped: its base takes TwistStamped."""
+    """The robot. namespace: with ``/`` first, or empty; stamped: its base subscribes to TwistStamped."""
 
     def __init__(self, router: str, *, namespace: str = "", stamped: bool = False, domain: int = 0) -> None:
         super().__init__()
         self.session = zenoh.open(config(router))
-        self.told: list[Command] = []
+        self.commands: list[JudgedCommand] = []
         self.velocity = (0.0, 0.0, 0.0)
         self.x = self.y = self.heading = 0.0
         self.clock_ns = time.time_ns
@@ -92,7 +92,7 @@ class StrictRobot(Judge):
         self._lock = threading.Lock()
         self._ends = threading.Event()
         self.tokens: dict[str, Any] = {}
-        """What it has declared; a test takes tokens back."""
+        """What it has declared; a test undeclares tokens."""
         self._hangs = False
         self._alive: dict[bytes, float] = {}
         """The gids of tokens, and until when they count: news of tokens and commands come on different threads."""
@@ -154,7 +154,7 @@ class StrictRobot(Judge):
         if up or roll or pitch or not all(map(math.isfinite, values)):
             self._violate(f"twist {values}")
         self.velocity = (forward, left, turn)
-        self.told.append(Command(at, gid, forward, left, turn))
+        self.commands.append(JudgedCommand(at, gid, forward, left, turn))
 
     def _judge(self, attachment: bytes) -> bytes:
         if len(attachment) != 33 or attachment[16] != 16:

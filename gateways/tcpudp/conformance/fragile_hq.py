@@ -13,11 +13,12 @@ from collections import Counter
 from collections.abc import Iterable
 from typing import Unpack
 
+import msgspec
+
 from gateways.tcpudp.conformance import parser as wire
-from gateways.tcpudp.conformance.operator import Operator
-from gateways.tcpudp.conformance.parser import Channel, Feature, HqTimes, Packet
-from zbridge.simulation.fragile import Work, log_violations
-from zbridge.simulation.hq_program import run_hq_program
+from gateways.tcpudp.conformance.operator import OperatorProgram
+from gateways.tcpudp.conformance.parser import Channel, FeatureFlag, ParsedPacket
+from zbridge.simulation.fragile import Work
 from zbridge.simulation.judge import Bounds, Ended, show
 from zbridge.simulation.timing import STAMPED, Read, ReadingThread
 
@@ -27,7 +28,7 @@ DEPLOYED_PORT = 11000
 """The UDP port that deployed programs bind ("Handshake", Ports)."""
 
 
-class _Phase(enum.Enum):
+class _HqPhase(enum.Enum):
     CONNECTED = enum.auto()
     GREETED = enum.auto()
     ANSWERED = enum.auto()
@@ -36,10 +37,21 @@ class _Phase(enum.Enum):
     ENDED = enum.auto()
 
 
+class HqTimes(msgspec.Struct, frozen=True, kw_only=True):
+    """The HQ's times in seconds; the defaults are those of the deployed HQ programs."""
+
+    answer_s: float = 0.015
+    """From packet 2 to the answer 3 (as captured)."""
+    probe_s: float = 2.0
+    """How long it waits for 4 and, after its 5, for 6."""
+    gap_s: float = 0.01
+    """Spacing of the robot's packets that exculpates it where this process read later than that."""
+
+
 _DEPLOYED = HqTimes()
 
 
-class FragileHq(Operator):
+class FragileTcpUdpHq(OperatorProgram):
     """An HQ program of one version, for one connection: records every violation and dies of the deadly ones.
 
     ``lidar_sim``: announce LidarSim; ``skips_map_flag``: read the map's size where the SLAMMap flag is;
@@ -50,7 +62,7 @@ class FragileHq(Operator):
     """
 
     OPTIONS = STAMPED
-    _phase: _Phase
+    _phase: _HqPhase
 
     def __init__(
         self,
@@ -65,12 +77,12 @@ class FragileHq(Operator):
         times: HqTimes = _DEPLOYED,
         **bounds: Unpack[Bounds],
     ) -> None:
-        if version not in wire.HQ_SENT or (lidar_sim and wire.FLAGS[version] <= Feature.LIDAR_SIM):
+        if version not in wire.HQ_SENT or (lidar_sim and wire.FLAGS[version] <= FeatureFlag.LIDAR_SIM):
             raise ValueError(f"no HQ of version {version}" + " announces LidarSim" * lidar_sim)
         super().__init__(**bounds)
         self.version = version
         self.established = asyncio.Event()
-        self.settings: wire.Announced | None = None
+        self.settings: wire.RobotAnnouncement | None = None
         self.position: tuple[float, float, float] | None = None
         self.map: bytes | None = None
         self.lidar_on: bool | None = None
@@ -80,7 +92,7 @@ class FragileHq(Operator):
         self._unasked = unasked or version != "1.1"
         self._asked: set[int] = set()
         self._repeat_s, self._udp_port, self._times = repeat_s, udp_port, times
-        self._phase = _Phase.CONNECTED
+        self._phase = _HqPhase.CONNECTED
         self._reads = wire.Reads(wire.HQ_LOSES_BYTES - 1)
         self._inbox: asyncio.Queue[tuple[Channel, Read]] = asyncio.Queue(_WAITING)
         self._robot: tuple[str, int] = ("", 0)
@@ -124,7 +136,7 @@ class FragileHq(Operator):
         return (self._converse(),)
 
     def _before_close(self) -> None:
-        self._phase = _Phase.ENDED
+        self._phase = _HqPhase.ENDED
         self._shut()  # ends the read of the thread
         self._thread.join()
         if self._udp is not None:
@@ -138,7 +150,7 @@ class FragileHq(Operator):
 
         1.3 sends 11, 12 and 61 by UDP whatever was agreed ("The gateway as robot"); the others where it was agreed.
         """
-        if self._phase is not _Phase.ESTABLISHED:
+        if self._phase is not _HqPhase.ESTABLISHED:
             self._event(f"lost: packet {kind} while {self._phase.name.lower()}")
             return
         self._asked.add(kind)
@@ -220,7 +232,7 @@ class FragileHq(Operator):
 
     # Packets
 
-    def _judge(self, packet: Packet, channel: Channel, at: float) -> None:
+    def _judge(self, packet: ParsedPacket, channel: Channel, at: float) -> None:
         kind, body = packet.kind, packet.body
         raw = f"{channel} packet {kind}, body {show(body)}"
         self.received.append((at, channel, kind, body))
@@ -231,29 +243,24 @@ class FragileHq(Operator):
             self._die(f"{problem}: {raw}")
         if packet.sender != wire.SERVER_ID:
             self._violate(f"id byte {packet.sender} instead of {wire.SERVER_ID}: {raw}")
-        if (due := self._channel(kind, body)) not in (channel, None):
+        if (due := wire.due_channel(kind, body, offered=self._udp is not None, works=self._works)) not in (
+            channel,
+            None,
+        ):
             self._violate(f"packet {kind} by {channel.upper()} instead of {due.upper()}: {raw}")
         if not self._report(self._untimely(kind), raw):
             self._report(wire.value_problem(kind, body, self.settings.side if self.settings else 0), raw)
             self._obey(kind, body)
 
-    def _channel(self, kind: int, body: bytes) -> Channel | None:
-        """Tell what must carry a packet ("Packets"); None: either, as without a 6 nothing was agreed."""
-        if kind == wire.UDP_ANSWER:
-            return "udp" if any(body) else "tcp"  # 6(false) is a violation by itself
-        if kind in wire.BY_UDP and self._udp is not None:
-            return None if self._works is None else "udp" if self._works else "tcp"
-        return "tcp"
-
     def _untimely(self, kind: int) -> str:
         """Tell why a packet is not due, empty if it is ("Handshake", "Translation")."""
         phase = self._phase
-        if (kind == wire.SERVER_SETTINGS) != (phase is _Phase.CONNECTED):
+        if (kind == wire.SERVER_SETTINGS) != (phase is _HqPhase.CONNECTED):
             return "a second 2" if kind == wire.SERVER_SETTINGS else f"packet {kind} before the settings 2"
         if kind == wire.START_UDP:
             if self._udp is not None:
                 return "a second 4"
-            return "" if phase is _Phase.ANSWERED else "a 4 before the answer 3, or not both set the UDP flag"
+            return "" if phase is _HqPhase.ANSWERED else "a 4 before the answer 3, or not both set the UDP flag"
         if kind == wire.UDP_ANSWER:
             return "" if self._udp is not None and not self._answered else "a 6 that is not due"
         if kind == wire.GET_SCAN and not self._lidar_sim:
@@ -261,8 +268,8 @@ class FragileHq(Operator):
         question = wire.ANSWERS.get(kind)
         if question is not None and not self._unasked and question not in self._asked:
             return f"a {kind} to an HQ 1.1 that never asked ({question}): it has no handler"
-        refusal = kind == wire.DEBUG and phase is _Phase.ANSWERED  # "No common version: say so"
-        due = refusal or phase in (_Phase.CONNECTED, _Phase.ESTABLISHED)
+        refusal = kind == wire.DEBUG and phase is _HqPhase.ANSWERED  # "No common version: say so"
+        due = refusal or phase in (_HqPhase.CONNECTED, _HqPhase.ESTABLISHED)
         return "" if due else f"packet {kind} before the session was established"
 
     def _obey(self, kind: int, body: bytes) -> None:
@@ -291,7 +298,7 @@ class FragileHq(Operator):
             settings = wire.announced(body, self.version, skips_map_flag=self._skips)
         except ValueError as error:
             self._die(f"{error}: packet 2, body {show(body)}")
-        self.settings, self._phase = settings, _Phase.GREETED
+        self.settings, self._phase = settings, _HqPhase.GREETED
         self._report(wire.announced_problem(settings, skips_map_flag=self._skips), f"packet 2, body {show(body)}")
         if not settings.understood:
             self._event(f"keeps its old flags: it does not understand the versions {settings.versions!r}")
@@ -299,14 +306,14 @@ class FragileHq(Operator):
             self._event(f"sees a wrong map size {settings.map_size} with the interval {settings.map_interval}")
         self._start(self._answer(settings))
 
-    async def _answer(self, settings: wire.Announced) -> None:
+    async def _answer(self, settings: wire.RobotAnnouncement) -> None:
         await asyncio.sleep(self._times.answer_s)
         flags = bytearray(wire.FLAGS[self.version])
-        flags[Feature.UDP] = self._offers_udp
+        flags[FeatureFlag.UDP] = self._offers_udp
         if self._lidar_sim:
-            flags[Feature.LIDAR_SIM] = True
+            flags[FeatureFlag.LIDAR_SIM] = True
         self._send_tcp(wire.CLIENT_SETTINGS, wire.string(wire.HQ_SENT[self.version]) + flags)
-        self._phase = _Phase.ANSWERED
+        self._phase = _HqPhase.ANSWERED
         if not (self._offers_udp and settings.udp):
             return self._establish()
         await asyncio.sleep(self._times.probe_s)
@@ -316,23 +323,20 @@ class FragileHq(Operator):
 
     def _probe(self) -> None:
         """Open the UDP socket, only now, and send 5 once ("Handshake" 4)."""
-        self._phase = _Phase.PROBING
+        self._phase = _HqPhase.PROBING
         self._udp = socket.socket(self._tcp.family, socket.SOCK_DGRAM)
         self._udp.setblocking(False)
-        self._bind(self._udp, self._tcp.getsockname()[0])
+        host, port = self._tcp.getsockname()[0], DEPLOYED_PORT if self._udp_port is None else self._udp_port
+        try:
+            self._udp.bind((host, port))
+        except OSError as error:  # several programs of one machine cannot all have the deployed port
+            if self._udp_port is not None or error.errno != errno.EADDRINUSE:
+                raise
+            self._udp.bind((host, 0))
+            self._event(f"UDP port {port} is taken, {self._udp.getsockname()[1]} instead")
         asyncio.get_running_loop().add_reader(self._udp.fileno(), self._read_datagrams)
         self._send_datagram(wire.UDP_PROBE)
         self._start(self._wait())
-
-    def _bind(self, sock: socket.socket, host: str) -> None:
-        """Bind the UDP port; several programs of one machine cannot all have the deployed one."""
-        try:
-            sock.bind((host, DEPLOYED_PORT if self._udp_port is None else self._udp_port))
-        except OSError as error:
-            if self._udp_port is not None or error.errno != errno.EADDRINUSE:
-                raise
-            sock.bind((host, 0))
-            self._event(f"UDP port {DEPLOYED_PORT} is taken, {sock.getsockname()[1]} instead")
 
     async def _wait(self) -> None:
         await asyncio.sleep(self._times.probe_s)
@@ -350,7 +354,7 @@ class FragileHq(Operator):
 
     def _send_status(self) -> None:
         """Send 7: whether a 6 came; 1.3 says true all the same ("Handshake" 6)."""
-        if self._phase is _Phase.PROBING:
+        if self._phase is _HqPhase.PROBING:
             connected = self._answered or self.version == "1.3"
             if not connected:
                 self._works = False
@@ -358,7 +362,7 @@ class FragileHq(Operator):
             self._establish()
 
     def _establish(self) -> None:
-        self._phase = _Phase.ESTABLISHED
+        self._phase = _HqPhase.ESTABLISHED
         self.established.set()
         if self._repeat_s is not None:
             self._start(self._repeat(self._repeat_s))
@@ -368,20 +372,3 @@ class FragileHq(Operator):
         while True:
             self.send(*self._stick)
             await asyncio.sleep(period_s)
-
-
-async def simulate_fragile_hq(
-    host: str,
-    port: int,
-    *,
-    version: str,
-    udp: bool,
-    drive: tuple[float, float] | None = None,
-    times: HqTimes = _DEPLOYED,
-) -> None:
-    """Run a fragile HQ until cancelled, dead or left; log violations, print what it does and what it died of.
-
-    drive: forward and turn, fractions of full scale; None: its stick stays centred. Raise OSError if nobody listens.
-    """
-    hq = FragileHq(version=version, udp=udp, times=times, note=log_violations())
-    await run_hq_program(hq, host, port, drive)

@@ -9,24 +9,24 @@ import math
 import random
 import socket
 import time
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Collection, Iterable
 from typing import Unpack
 
 from gateways.tcpudp.conformance import parser as wire
-from gateways.tcpudp.conformance.machine import Machine
-from gateways.tcpudp.conformance.parser import Channel, Feature, Loss, Packet, Times
-from zbridge.simulation.fragile import FragileServer, Work, log_violations, simulate
+from gateways.tcpudp.conformance.machine import JudgedRobot, Loss, Quirks
+from gateways.tcpudp.conformance.parser import Channel, FeatureFlag, ParsedPacket, RobotTimes
+from zbridge.simulation.fragile import FragileServer, Work
 from zbridge.simulation.judge import Bounds, Chances, show
 from zbridge.simulation.sockets import bind_tcp_and_udp, readable
 from zbridge.simulation.timing import PollingReader, Ticker
 
 _STEP_S, _MOST_MOVE_S = 0.02, 0.1
 """Seconds between two steps of the robot, and most seconds for which it moves in one."""
-_LOOK_S = 0.006
-"""Seconds between two looks at a connection that brings nothing: less than the spacing that is demanded."""
+_POLL_S = 0.006
+"""Seconds between two polls of a connection that brings nothing: less than the spacing that is demanded."""
 
 
-class _Phase(enum.Enum):
+class _RobotPhase(enum.Enum):
     LISTENING = enum.auto()
     GREETED = enum.auto()
     ASLEEP = enum.auto()
@@ -35,26 +35,22 @@ class _Phase(enum.Enum):
     FROZEN = enum.auto()
 
 
-_DEPLOYED = Times()
+_DEPLOYED, _NO_QUIRKS = RobotTimes(), Quirks()
 _EXPECTED = {
-    _Phase.GREETED: {wire.DEBUG, wire.CLIENT_SETTINGS},
-    _Phase.ASLEEP: {wire.UDP_PROBE, wire.UDP_STATUS},
-    _Phase.WOKEN: {wire.UDP_PROBE, wire.UDP_STATUS},
+    _RobotPhase.GREETED: {wire.DEBUG, wire.CLIENT_SETTINGS},
+    _RobotPhase.ASLEEP: {wire.UDP_PROBE, wire.UDP_STATUS},
+    _RobotPhase.WOKEN: {wire.UDP_PROBE, wire.UDP_STATUS},
 }
 
 
 class FragileRobot(FragileServer):
     """A robot of one version: serves one connection, records every violation and dies of the deadly ones.
 
-    ``features``: flags announced besides UDP, default all of the version; ``obeys``: packets registered though not
-    announced (``options.force``); ``client_id``: default seeded; ``parts``: of a "1.4" map; ``side``: cells along a
-    side of the map; ``misnamed``: the fraction of positions sent as id 53; ``misread``: the fraction of packets dropped
-    after the handshake, chosen for each packet id by itself; ``again``: serve a connection after the first, which loses
-    half of all packets in both directions and gets no telemetry ("One usable connection"). A row of ``received`` and
-    of the lists like it: monotonic seconds, channel, id, body.
+    ``features``: flags announced besides UDP, default all of the version. A row of ``received`` and of the lists like
+    it: monotonic seconds, channel, id, body.
     """
 
-    _phase: _Phase
+    _phase: _RobotPhase
     _polling: PollingReader
 
     def __init__(
@@ -63,36 +59,29 @@ class FragileRobot(FragileServer):
         version: str,
         udp: bool,
         seed: int,
-        features: Collection[Feature] | None = None,
-        obeys: Collection[Feature] = (),
-        client_id: int | None = None,
-        times: Times = _DEPLOYED,
-        loss: Loss = Loss.NOTHING,
-        parts: int = 4096,
-        side: int = wire.SIDE,
-        misnamed: float = 0.25,
-        misread: float = 0.0,
-        again: bool = False,
+        features: Collection[FeatureFlag] | None = None,
+        times: RobotTimes = _DEPLOYED,
+        quirks: Quirks = _NO_QUIRKS,
         **bounds: Unpack[Bounds],
     ) -> None:
         super().__init__(**bounds)
         self.version = version
         self.features = wire.announcement(version, features, udp=udp)
-        self.client_id = client_id or random.Random(seed).randint(1, 255)
+        self.client_id = quirks.client_id or random.Random(seed).randint(1, 255)
         self.misread = self._rows()
         self.piled = self._rows()
         """What was lost in a read that this process itself joined, because it was late."""
         self.ignored = self._rows()
         """What robots of 1.1 and 1.2 ignored: the first packet read alone after they lost what had piled up."""
-        self._registered = wire.registered(version, self.features | frozenset(obeys))
-        self._times, self._loss, self._parts, self._side = times, loss, parts, side
-        self._chance, self._misnamed, self._misread = Chances(seed), misnamed, misread
-        self._again, self._poor = again, False
-        self.machine = Machine(self._chance["talk"], side)
-        self._phase = _Phase.LISTENING
+        self._registered = wire.registered(version, self.features | frozenset(quirks.obeys))
+        self._times, self._quirks, self._chance = times, quirks, Chances(seed)
+        self._poor = False
+        """True for a connection after the first."""
+        self.machine = JudgedRobot(self._chance["talk"], quirks.side)
+        self._phase = _RobotPhase.LISTENING
         self._udp: socket.socket | None = None
         self._wake_at = self._closed_s = self._awake_s = 0.0
-        """This process's own time, which stands still while the process is late: it judges what was in flight."""
+        """This process's own time, which stops while the process is late: it judges what was in flight."""
         self._forget()
 
     def _forget(self) -> None:
@@ -100,7 +89,7 @@ class FragileRobot(FragileServer):
         self._reads = wire.Reads()
         self._ignores_next = False
         self._awake = asyncio.Event()
-        self._hq_features: frozenset[Feature] = frozenset()
+        self._hq_features: frozenset[FeatureFlag] = frozenset()
         self._source: tuple[str, int] | None = None
         self._probes = 0
         self._offered = self._answered = self._asked_map = False
@@ -122,14 +111,14 @@ class FragileRobot(FragileServer):
 
     def _free(self) -> bool:
         """True with ``again`` once the connection before has ended ("One usable connection per start")."""
-        return self._again and self._conn is None
+        return self._quirks.again and self._conn is None
 
     def _begin(self, conn: socket.socket) -> None:
         """Begin with an HQ; a connection after the first is a poor one."""
-        if self._phase is not _Phase.LISTENING:
+        if self._phase is not _RobotPhase.LISTENING:
             self._poor, self.client_id, self._broken = True, max(2, self.client_id) % 255 + 1, ""
             self._forget()
-        self._phase = _Phase.GREETED
+        self._phase = _RobotPhase.GREETED
         self._start(self._converse(conn))
 
     def cut(self) -> None:
@@ -139,10 +128,10 @@ class FragileRobot(FragileServer):
     async def _converse(self, conn: socket.socket) -> None:
         """Speak first, then take one packet per read with a short sleep in between ("Handshake")."""
         try:
-            settings = wire.server_settings(self.version, self.client_id, self.features, self._side)
+            settings = wire.server_settings(self.version, self.client_id, self.features, self._quirks.side)
             await self._send(wire.SERVER_SETTINGS, settings)
             self._polling = PollingReader(conn, wire.READ_BYTES)
-            while data := await self._polling.read(_LOOK_S):
+            while data := await self._polling.read(_POLL_S):
                 await self._read_packet(data)
                 await asyncio.sleep(self._chance["sleep"].uniform(0, self._times.read_s))
             self._event(f"the connection broke: {self._broken}" if self._broken else "the HQ closed the connection")
@@ -150,13 +139,13 @@ class FragileRobot(FragileServer):
             self._event(f"the connection broke: {error!r}")
         finally:
             self._shut()
-            self._phase, self._conn, self._closed_s = _Phase.FROZEN, None, self._awake_s
+            self._phase, self._conn, self._closed_s = _RobotPhase.FROZEN, None, self._awake_s
             self._awake.set()
 
     async def _read_packet(self, data: bytes) -> None:
         """Take one read as one packet: what piled up while this process was stalled is lost.
 
-        Joined packets are the HQ's fault if they came in less time, since a look found nothing, than correctly spaced
+        Joined packets are the HQ's fault if they came in less time, since a poll found nothing, than correctly spaced
         packets need; the text says how long this process did not read if it may be at fault itself.
         """
         received, problem = self._reads.take(data)
@@ -174,13 +163,15 @@ class FragileRobot(FragileServer):
         elif received is not None:
             await self._judge(received, "tcp")
 
-    async def _send(self, kind: int, body: bytes = b"") -> None:
+    async def _send(self, kind: int, body: bytes = b"", *, by_udp: bool = False) -> None:
         """Send by UDP what the table marks UDP* when that was agreed, all else by TCP ("Packets")."""
         data = wire.packet(kind, body)
-        if self._phase is _Phase.ESTABLISHED and self._loses():
+        if self._phase is _RobotPhase.ESTABLISHED and self._loses():
             return
-        if kind in wire.BY_UDP and self._status:
-            self._send_datagram(data)
+        if by_udp or (kind in wire.BY_UDP and self._status):
+            if self._udp is not None and self._source is not None:
+                with contextlib.suppress(OSError):
+                    self._udp.sendto(data, self._source)
         elif self._conn is not None:
             try:
                 async with asyncio.timeout(self._times.send_s), self._sending:
@@ -204,12 +195,12 @@ class FragileRobot(FragileServer):
         """Take one datagram ("The gateway as HQ": no UDP before TCP, no wrong length field)."""
         if self._loses():
             return
-        if self._phase is _Phase.FROZEN:
+        if self._phase is _RobotPhase.FROZEN:
             if self._awake_s - self._closed_s > self._times.flight_s:
                 self._violate(f"a datagram after the TCP connection ended: {show(data)}")
             return
         if not self._offered:
-            before = "TCP" if self._phase is _Phase.LISTENING else "the robot sent 4"
+            before = "TCP" if self._phase is _RobotPhase.LISTENING else "the robot sent 4"
             self._die(f"a datagram before {before}: {show(data)}")
         received = wire.datagram(data)
         if received is None:
@@ -225,42 +216,37 @@ class FragileRobot(FragileServer):
         else:
             await self._judge(received, "udp")
 
-    def _send_datagram(self, data: bytes) -> None:
-        if self._udp is not None and self._source is not None:
-            with contextlib.suppress(OSError):
-                self._udp.sendto(data, self._source)
-
-    def _probe(self) -> None:
+    async def _probe(self) -> None:
         """Answer the first 5 with 6(true) from the TCP port's number, to where it came from ("Handshake" 5)."""
         self._probes += 1
         if self._probes > 1:
             self._violate(f"{self._probes} probes 5 by UDP instead of one")
-        elif self._phase is not _Phase.ASLEEP:
+        elif self._phase is not _RobotPhase.ASLEEP:
             self._violate(f"the probe 5 came later than {self._times.probe_s:g} s after the 4")
-        elif self._loss is Loss.NOTHING and not self._loses():
+        elif self._quirks.loss is Loss.NOTHING and not self._loses():
             self._answered = True
-            self._send_datagram(wire.packet(wire.UDP_ANSWER, b"\x01"))
+            await self._send(wire.UDP_ANSWER, b"\x01", by_udp=True)
 
     # Packets
 
-    async def _judge(self, received: Packet, channel: Channel) -> None:
+    async def _judge(self, received: ParsedPacket, channel: Channel) -> None:
         kind, body = received.kind, received.body
         raw = f"{channel} packet {kind}, body {show(body)}"
-        if self._phase is _Phase.ESTABLISHED and self._chance[f"misread {kind}"].random() < self._misread:
+        if self._phase is _RobotPhase.ESTABLISHED and self._chance[f"misread {kind}"].random() < self._quirks.misread:
             return self.misread.append((time.monotonic(), channel, kind, body))
-        if self._phase is _Phase.ESTABLISHED and channel == "tcp" and self._loses():
+        if self._phase is _RobotPhase.ESTABLISHED and channel == "tcp" and self._loses():
             return None
         self.received.append((time.monotonic(), channel, kind, body))
         if kind not in self._registered:
             self._die(f"unregistered packet id {kind} for a robot {self.version} with these flags: {raw}")
-        senders = {0, self.client_id} if self._phase is _Phase.GREETED else {self.client_id}
+        senders = {0, self.client_id} if self._phase is _RobotPhase.GREETED else {self.client_id}
         if received.sender not in senders:
             self._violate(f"id byte {received.sender} instead of {self.client_id}: {raw}")
         if kind == wire.DEBUG and body == bytes(4):
             self._die(f"a debugMessage with an empty text: {raw}")
         if self._report(self._problem(kind, body, channel), raw):
             return None
-        return self._probe() if kind == wire.UDP_PROBE else await self._obey(kind, body)
+        return await self._obey(kind, body)
 
     def _problem(self, kind: int, body: bytes, channel: Channel) -> str:
         by_udp = kind == wire.UDP_PROBE or (kind in wire.BY_UDP and bool(self._status))
@@ -276,7 +262,9 @@ class FragileRobot(FragileServer):
         return wire.body_problem(kind, body)
 
     async def _obey(self, kind: int, body: bytes) -> None:
-        if kind == wire.CLIENT_SETTINGS:
+        if kind == wire.UDP_PROBE:
+            await self._probe()
+        elif kind == wire.CLIENT_SETTINGS:
             await self._settle(body)
         elif kind == wire.UDP_STATUS:
             self._conclude(any(body))
@@ -288,16 +276,19 @@ class FragileRobot(FragileServer):
             self.machine.lidar_on = body[0] == 1
             await self._send(wire.LIDAR_STATUS, self.machine.body(wire.LIDAR_STATUS))
         elif kind == wire.GET_POSITION:
-            misnamed = self._chance["answer"].random() < self._misnamed
+            misnamed = self._chance["answer"].random() < self._quirks.misnamed
             await self._send(wire.MAP if misnamed else wire.POSITION, self.machine.body(wire.POSITION))
-        elif kind == wire.GET_MAP:
-            await self._send_map()
+        elif kind == wire.GET_MAP:  # the first answer of a 1.1 robot is no map yet, the handler of a "1.4" is empty
+            first, self._asked_map = not self._asked_map, True
+            if self.version != "1.4":
+                none_yet = first and self.version == "1.1"
+                await self._send(wire.MAP, b"" if none_yet else self.machine.body(wire.MAP))
 
     # Handshake
 
     async def _settle(self, body: bytes) -> None:
         """Take the HQ's settings; judge its version string ("Settings and version negotiation")."""
-        if self._phase is not _Phase.GREETED:
+        if self._phase is not _RobotPhase.GREETED:
             return self._violate(f"a second clientSettings: {show(body)}")
         settings = wire.client_settings(body)
         if wire.deadly(self.version, settings):
@@ -307,25 +298,25 @@ class FragileRobot(FragileServer):
         else:
             self._violate(f"versions {settings.versions!r} to a robot that understands {safe!r} only: {show(body)}")
         self._report(settings.problem, show(body))
-        if Feature.UDP in self.features & self._hq_features:
+        if FeatureFlag.UDP in self.features & self._hq_features:
             return await self._offer_udp()
         return self._establish()
 
     async def _offer_udp(self) -> None:
         """Send 4, sleep, then take in one read what came meanwhile: the single 7 ("Handshake" 3 to 6)."""
-        self._offered, self._phase = True, _Phase.ASLEEP
+        self._offered, self._phase = True, _RobotPhase.ASLEEP
         self._wake_at = time.monotonic() + self._times.probe_s
         self._quiet_until = time.monotonic() + self._times.silence_s
         await self._send(wire.START_UDP)
         self._start(self._miss_status())
         await asyncio.sleep(self._times.probe_s)
         late_s = time.monotonic() - self._wake_at
-        self._phase = _Phase.WOKEN
+        self._phase = _RobotPhase.WOKEN
         self._awake.set()
         data = self._polling.poll()
         if data == b"":
             return
-        if not self._answered and self._loss is not Loss.ANSWER:
+        if not self._answered and self._quirks.loss is not Loss.ANSWER:
             await self._send(wire.UDP_ANSWER, b"\x00")
         if not self._probes:
             self._violate(f"no 5 by UDP within {self._times.probe_s:g} s of the 4")
@@ -353,12 +344,12 @@ class FragileRobot(FragileServer):
         return self._establish()
 
     def _establish(self) -> None:
-        self._phase = _Phase.ESTABLISHED
+        self._phase = _RobotPhase.ESTABLISHED
         if self._poor:
             return
         if self._times.unasked_s:
             self._start(self._chatter(self._conn))
-        if self.version == "1.4" and Feature.LIDAR_SIM in self._hq_features:
+        if self.version == "1.4" and FeatureFlag.LIDAR_SIM in self._hq_features:
             self._start(self._send_parts(self._conn))
 
     def _loses(self) -> bool:
@@ -375,18 +366,10 @@ class FragileRobot(FragileServer):
             self._awake_s += min(ticker.passed_s, _STEP_S)
             self.machine.step(min(ticker.passed_s, _MOST_MOVE_S))
 
-    async def _send_map(self) -> None:
-        """Answer 52; the first answer of a 1.1 robot says no map yet, the handler of a "1.4" is empty ("Packets")."""
-        if self.version == "1.1" and not self._asked_map:
-            await self._send(wire.MAP)
-        elif self.version != "1.4":
-            await self._send(wire.MAP, self.machine.body(wire.MAP))
-        self._asked_map = True
-
     async def _send_parts(self, conn: socket.socket | None) -> None:
         """Send the map in parts again and again; TCP is read meanwhile ("The gateway as HQ")."""
         while True:
-            for body in self.machine.parts(self._parts):
+            for body in self.machine.parts(self._quirks.parts):
                 if self._conn is not conn:
                     return
                 await self._send(wire.MAP_PART, body)
@@ -400,18 +383,3 @@ class FragileRobot(FragileServer):
             if self._conn is not conn:
                 return
             await self._send(kind, body or self.machine.body(kind))
-
-
-async def simulate_fragile(
-    host: str,
-    port: int,
-    *,
-    version: str,
-    udp: bool,
-    seed: int,
-    ready: Callable[[int], None],
-    times: Times = _DEPLOYED,
-) -> None:
-    """Run a fragile robot until cancelled or dead; log each violation, and print what it died of."""
-    robot = FragileRobot(version=version, udp=udp, seed=seed, times=times, note=log_violations())
-    await simulate(robot, host, port, ready)

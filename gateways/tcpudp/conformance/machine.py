@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import enum
 import math
 import struct
 from collections.abc import Collection, Iterator
 from random import Random
 
+import msgspec
 import numpy as np
 
 from gateways.tcpudp.conformance import parser as wire
-from gateways.tcpudp.conformance.parser import CELL_CM, SIDE, Feature, packet, string
+from gateways.tcpudp.conformance.parser import CELL_CM, SIDE, FeatureFlag, packet, string
 from zbridge.simulation.world import Body, Grid, cast
 
 _SPEED_M_S, _TURN_RAD_S = 0.5, 1.0
@@ -19,8 +21,37 @@ _PROGRAM = (0.2, 0.0, 0.3)
 """How the robot's own program drives: m/s forward and left, rad/s."""
 
 
-class Machine:
-    """One robot; ``random`` seeds what it says. ``side``: cells along a side of its map."""
+class Loss(enum.Enum):
+    """Which datagram of the UDP probe gets lost."""
+
+    NOTHING = enum.auto()
+    PROBE = enum.auto()
+    ANSWER = enum.auto()
+
+
+class Quirks(msgspec.Struct, frozen=True, kw_only=True):
+    """What one robot does otherwise than the others of its version."""
+
+    client_id: int | None = None
+    """The id that it gives its first HQ; None: seeded."""
+    obeys: Collection[FeatureFlag] = ()
+    """Features whose packets it has registered without announcing them (``options.force``)."""
+    loss: Loss = Loss.NOTHING
+    parts: int = 4096
+    """Parts of a "1.4" map."""
+    side: int = SIDE
+    """Cells along a side of the map."""
+    misnamed: float = 0.25
+    """The fraction of positions sent as id 53."""
+    misread: float = 0.0
+    """The fraction of packets dropped after the handshake, chosen for each packet id by itself."""
+    again: bool = False
+    """It serves a connection after the first, which loses half of all packets in both directions and gets no telemetry
+    ("One usable connection")."""
+
+
+class JudgedRobot:
+    """One robot; ``random`` seeds what it sends. ``side``: cells along a side of its map."""
 
     def __init__(self, random: Random, side: int = SIDE) -> None:
         self.place = Body()
@@ -42,7 +73,7 @@ class Machine:
         self._drive = (y * speed * _SPEED_M_S, -x * speed * _SPEED_M_S, -turn * _TURN_RAD_S)
 
     def choose(self, body: bytes) -> None:
-        """Take the body of 10: in mode 3 the robot's own program drives, whatever 13 says ("Translation").
+        """Take the body of 10: in mode 3 the robot's own program drives, despite any 13 ("Translation").
 
         When it ends, the motors keep running: only a 13 after it stops them.
         """
@@ -84,18 +115,20 @@ class Machine:
             yield struct.pack("<ii", start, start + size) + self._map[start : start + size].ljust(size, b"\0")
 
     def unasked(
-        self, version: str, features: Collection[Feature], hq_features: Collection[Feature]
+        self, version: str, features: Collection[FeatureFlag], hq_features: Collection[FeatureFlag]
     ) -> Iterator[tuple[int, bytes]]:
-        """Give what the robot says unasked, forever; once a debugMessage with two headers ("The gateway as HQ").
+        """Yield what the robot sends unasked, forever; once a debugMessage with two headers ("The gateway as HQ").
 
         An empty body: ask :meth:`body` for it when it is sent.
         """
         due = [(wire.DEBUG, packet(wire.DEBUG, string("two headers")))]
-        kinds = [wire.DEBUG] + [wire.CAMERA] * (Feature.CAM in features) + [wire.CHAT] * (Feature.CHAT in features)
-        kinds += [wire.LIDAR_STATUS] * (Feature.LIDAR in features)
+        kinds = (
+            [wire.DEBUG] + [wire.CAMERA] * (FeatureFlag.CAM in features) + [wire.CHAT] * (FeatureFlag.CHAT in features)
+        )
+        kinds += [wire.LIDAR_STATUS] * (FeatureFlag.LIDAR in features)
         if wire.maps(version, features):
             kinds += [wire.POSITION] + [wire.MAP] * (version != "1.4")
-        kinds += [wire.GET_SCAN] * (Feature.LIDAR_SIM in features and Feature.LIDAR_SIM in hq_features)
+        kinds += [wire.GET_SCAN] * (FeatureFlag.LIDAR_SIM in features and FeatureFlag.LIDAR_SIM in hq_features)
         while True:
             due += [(kind, b"") for kind in kinds]
             self._random.shuffle(due)

@@ -1,4 +1,4 @@
-"""What the operator of an HQ program does; the judge says when and how that is sent ("Packets")."""
+"""What the operator of an HQ program does; the judge decides when and how that is sent ("Packets")."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from zbridge.simulation.hq_program import HqProgram
 from zbridge.simulation.judge import Bounds
 
 
-class Operator(HqProgram):
+class OperatorProgram(HqProgram):
     """The sticks and buttons of an HQ program."""
 
     def __init__(self, **bounds: Unpack[Bounds]) -> None:

@@ -31,7 +31,7 @@ SIDE, CELL_CM = 100, 10
 _TAIL_BYTES = 1 << 20
 
 
-class Feature(enum.IntEnum):
+class FeatureFlag(enum.IntEnum):
     """A feature flag; the value is its place in the settings ("Settings and version negotiation")."""
 
     UDP = 0
@@ -48,7 +48,7 @@ FLAGS = {"1.1": 5, "1.2": 6, "1.3": 7, "1.4": 7}
 SENT = {"1.1": "1.1", "1.2": "1.2", "1.3": "1.1,1.2,1.3", "1.4": "1.1,1.2,1.3,1.4"}
 """The version string a robot sends."""
 UNDERSTOOD = {"1.1": "1.1", "1.2": "1.2", "1.3": "1.1,1.2,1.3", "1.4": "1.1,1.2,1.3"}
-"""The version string a robot takes without harm."""
+"""The version string a robot accepts without harm."""
 DEADLY_ENTRIES = frozenset({1, 2, 4, 8})
 """Lengths of a version list that crash robots 1.3 and "1.4"."""
 HQ_LOSES_BYTES = 2200
@@ -64,7 +64,7 @@ IGNORE_ONE = frozenset({"1.1", "1.2"})
 """Versions of robots that ignore the first packet read alone after a stall ("The gateway as robot")."""
 
 
-class Times(msgspec.Struct, frozen=True, kw_only=True):
+class RobotTimes(msgspec.Struct, frozen=True, kw_only=True):
     """The robot's times in seconds; the defaults are those of the deployed robots."""
 
     read_s: float = 0.005
@@ -85,26 +85,7 @@ class Times(msgspec.Struct, frozen=True, kw_only=True):
     """Longest wait for its own send."""
 
 
-class HqTimes(msgspec.Struct, frozen=True, kw_only=True):
-    """The HQ's times in seconds; the defaults are those of the deployed HQ programs."""
-
-    answer_s: float = 0.015
-    """From packet 2 to the answer 3 (as captured)."""
-    probe_s: float = 2.0
-    """How long it waits for 4 and, after its 5, for 6."""
-    gap_s: float = 0.01
-    """Spacing of the robot's packets that exculpates it where this process read later than that."""
-
-
-class Loss(enum.Enum):
-    """Which datagram of the UDP probe gets lost."""
-
-    NOTHING = enum.auto()
-    PROBE = enum.auto()
-    ANSWER = enum.auto()
-
-
-class Packet(msgspec.Struct, frozen=True):
+class ParsedPacket(msgspec.Struct, frozen=True):
     """One packet as it was read."""
 
     sender: int
@@ -112,24 +93,24 @@ class Packet(msgspec.Struct, frozen=True):
     body: bytes
 
 
-class Settings(msgspec.Struct, frozen=True):
-    """What an HQ says about itself in packet 3."""
+class HqAnnouncement(msgspec.Struct, frozen=True):
+    """What an HQ announces in packet 3."""
 
     versions: str
-    features: frozenset[Feature]
+    features: frozenset[FeatureFlag]
     problem: str = ""
     readable: bool = True
 
 
-class Announced(msgspec.Struct, frozen=True):
-    """What a robot says about itself in packet 2, as one HQ reads it."""
+class RobotAnnouncement(msgspec.Struct, frozen=True):
+    """What a robot announces in packet 2, as one HQ reads it."""
 
     client: int
     versions: str
     block: bytes
     understood: str = ""
     """The version whose block the HQ read; empty: it keeps its old flags."""
-    features: frozenset[Feature] = frozenset()
+    features: frozenset[FeatureFlag] = frozenset()
     map_size: int = 0
     map_interval: int = 0
 
@@ -151,16 +132,16 @@ class Announced(msgspec.Struct, frozen=True):
         return max(size // interval, 0) if interval else 0
 
 
-def cut(data: bytes) -> tuple[list[Packet], bytes, bool]:
+def cut(data: bytes) -> tuple[list[ParsedPacket], bytes, bool]:
     """Cut packets off the front ("Framing"); give them, what is left, and whether that is hopeless."""
-    packets: list[Packet] = []
+    packets: list[ParsedPacket] = []
     while len(data) >= 4:
         (length,) = struct.unpack_from("<i", data)
         if not 2 <= length <= _TAIL_BYTES:
             return packets, data, True
         if len(data) < 4 + length:
             break
-        packets.append(Packet(data[4], data[5], data[6 : 4 + length]))
+        packets.append(ParsedPacket(data[4], data[5], data[6 : 4 + length]))
         data = data[4 + length :]
     return packets, data, False
 
@@ -169,14 +150,14 @@ class Reads:
     """The reads of one TCP connection: each must be exactly one packet ("The gateway as HQ")."""
 
     def __init__(self, most: int = READ_BYTES) -> None:
-        self.joined: list[Packet] = []
+        self.joined: list[ParsedPacket] = []
         """The packets of the last read if they were several and whole."""
         self.hopeless = False
         """The last read had a wrong length field."""
         self._tail = b""
         self._most = most
 
-    def take(self, data: bytes) -> tuple[Packet | None, str]:
+    def take(self, data: bytes) -> tuple[ParsedPacket | None, str]:
         """Give the packet that one read is, or what is wrong with it; neither for the rest of a split packet."""
         late = bool(self._tail)
         packets, self._tail, self.hopeless = cut(self._tail + data)
@@ -204,7 +185,19 @@ class Reads:
         return f"a packet of {size} bytes, over {self._most}: {show(data)}"
 
 
-def datagram(data: bytes) -> Packet | None:
+def due_channel(kind: int, body: bytes, *, offered: bool, works: bool | None) -> Channel | None:
+    """Tell what must carry a packet of the robot ("Packets"); None: either, as without a 6 nothing was agreed.
+
+    ``offered``: the robot sent 4; ``works``: whether UDP was agreed, None until a 6 came.
+    """
+    if kind == UDP_ANSWER:
+        return "udp" if any(body) else "tcp"  # 6(false) is a violation by itself
+    if kind in BY_UDP and offered:
+        return None if works is None else "udp" if works else "tcp"
+    return "tcp"
+
+
+def datagram(data: bytes) -> ParsedPacket | None:
     """Read a datagram as exactly one packet; none where its length field is wrong ("Framing")."""
     packets, rest, _ = cut(data)
     return packets[0] if len(packets) == 1 and not rest else None
@@ -220,37 +213,37 @@ def string(text: str) -> bytes:
     return struct.pack("<i", len(text)) + text.encode("ascii")
 
 
-def server_settings(version: str, client: int, features: Collection[Feature], side: int = SIDE) -> bytes:
+def server_settings(version: str, client: int, features: Collection[FeatureFlag], side: int = SIDE) -> bytes:
     """Write the body of packet 2 as a robot of ``version`` does ("Settings and version negotiation")."""
-    flags = bytes(flag in features for flag in list(Feature)[: FLAGS[version]])
+    flags = bytes(flag in features for flag in list(FeatureFlag)[: FLAGS[version]])
     sizes = struct.pack("<ii", side * CELL_CM, CELL_CM) if FLAGS[version] == 7 else b""
     return bytes([client]) + string(SENT[version]) + flags + sizes
 
 
-def announcement(version: str, features: Collection[Feature] | None, *, udp: bool) -> frozenset[Feature]:
+def announcement(version: str, features: Collection[FeatureFlag] | None, *, udp: bool) -> frozenset[FeatureFlag]:
     """Give the flags that a robot announces, all of its version by default; raise ValueError for others."""
-    known = frozenset(list(Feature)[: FLAGS[version]])
+    known = frozenset(list(FeatureFlag)[: FLAGS[version]])
     others = known if features is None else frozenset(features)
     if not others <= known:
         raise ValueError(f"a robot of version {version} has no {sorted(flag.name for flag in others - known)}")
-    return (others - {Feature.UDP}) | ({Feature.UDP} if udp else frozenset())
+    return (others - {FeatureFlag.UDP}) | ({FeatureFlag.UDP} if udp else frozenset())
 
 
-def client_settings(body: bytes) -> Settings:
+def client_settings(body: bytes) -> HqAnnouncement:
     """Read the body of packet 3 ("Settings and version negotiation")."""
-    nothing: frozenset[Feature] = frozenset()
+    nothing: frozenset[FeatureFlag] = frozenset()
     count = struct.unpack_from("<i", body)[0] if len(body) >= 4 else -1
     if not 0 <= count <= len(body) - 4 or not body[4 : 4 + count].isascii():
-        return Settings("", nothing, "no version string", readable=False)
+        return HqAnnouncement("", nothing, "no version string", readable=False)
     versions, flags = body[4 : 4 + count].decode("ascii"), body[4 + count :]
     expected = FLAGS.get(max(versions.split(",")), 0)
     problem = (
         "" if len(flags) == expected else f"{len(flags)} flags for the versions {versions!r} instead of {expected}"
     )
-    return Settings(versions, frozenset(flag for flag in Feature if any(flags[flag : flag + 1])), problem)
+    return HqAnnouncement(versions, frozenset(flag for flag in FeatureFlag if any(flags[flag : flag + 1])), problem)
 
 
-def announced(body: bytes, version: str, *, skips_map_flag: bool = False) -> Announced:
+def announced(body: bytes, version: str, *, skips_map_flag: bool = False) -> RobotAnnouncement:
     """Read the body of packet 2 as an HQ of ``version`` does; ValueError for what cripples it.
 
     ``skips_map_flag``: it looks for the map's size where the SLAMMap flag is ("The gateway as robot").
@@ -258,7 +251,7 @@ def announced(body: bytes, version: str, *, skips_map_flag: bool = False) -> Ann
     count = struct.unpack_from("<i", body, 1)[0] if len(body) >= 5 else -1
     if not 0 <= count <= len(body) - 5 or not body[5 : 5 + count].isascii():
         raise ValueError("no version string")
-    settings = Announced(body[0], body[5 : 5 + count].decode("ascii"), body[5 + count :])
+    settings = RobotAnnouncement(body[0], body[5 : 5 + count].decode("ascii"), body[5 + count :])
     understood = _understood(version, settings.versions)
     if not understood:
         return settings
@@ -268,11 +261,11 @@ def announced(body: bytes, version: str, *, skips_map_flag: bool = False) -> Ann
     if len(settings.block) < size:
         count = len(settings.block)
         raise ValueError(f"{count} bytes of settings for the versions {settings.versions!r} instead of {size}")
-    features = frozenset(flag for flag in list(Feature)[:flags] if settings.block[flag])
+    features = frozenset(flag for flag in list(FeatureFlag)[:flags] if settings.block[flag])
     length, interval = struct.unpack_from("<ii", settings.block, flags) if sized else (0, 0)
     if sized and not interval:
         raise ValueError("SLAMMapIntervall 0, a division by zero")
-    return Announced(settings.client, settings.versions, settings.block, understood, features, length, interval)
+    return RobotAnnouncement(settings.client, settings.versions, settings.block, understood, features, length, interval)
 
 
 def _understood(version: str, versions: str) -> str:
@@ -282,7 +275,7 @@ def _understood(version: str, versions: str) -> str:
     return next((known for known in ("1.3", "1.2", "1.1") if known in versions.split(",")), "")
 
 
-def announced_problem(settings: Announced, *, skips_map_flag: bool = False) -> str:
+def announced_problem(settings: RobotAnnouncement, *, skips_map_flag: bool = False) -> str:
     """Tell what is wrong with packet 2 without crippling an HQ ("Settings and version negotiation")."""
     newest = max((known for known in settings.versions.split(",") if known in FLAGS), default="")
     size = FLAGS[newest] + 8 * (FLAGS[newest] == 7) if newest else len(settings.block)
@@ -291,32 +284,32 @@ def announced_problem(settings: Announced, *, skips_map_flag: bool = False) -> s
     return f"client id {settings.client}" if settings.client < 2 else ""
 
 
-def deadly(version: str, settings: Settings) -> bool:
+def deadly(version: str, settings: HqAnnouncement) -> bool:
     """Tell whether a version list crashes a robot ("Settings and version negotiation")."""
     return "," in SENT[version] and settings.readable and len(settings.versions.split(",")) in DEADLY_ENTRIES
 
 
-def registered(version: str, features: Collection[Feature]) -> frozenset[int]:
+def registered(version: str, features: Collection[FeatureFlag]) -> frozenset[int]:
     """Tell which packet ids from the HQ do not crash a robot ("Packets", "The gateway as HQ")."""
     ids = {DEBUG, CLIENT_SETTINGS}
-    if Feature.UDP in features:
+    if FeatureFlag.UDP in features:
         ids |= {UDP_PROBE, UDP_STATUS}
-    if Feature.JOYSTICK in features:
+    if FeatureFlag.JOYSTICK in features:
         ids |= {MODE, MOVE, ROTATE, STOP, MOVE_AI}
-    if Feature.CHAT in features:
+    if FeatureFlag.CHAT in features:
         ids |= {CHAT}
-    if Feature.LIDAR in features:
+    if FeatureFlag.LIDAR in features:
         ids |= {LIDAR_MODE}
     if maps(version, features):
         ids |= {GET_MAP, GET_POSITION}
-    if Feature.LIDAR_SIM in features and FLAGS[version] > Feature.LIDAR_SIM:
+    if FeatureFlag.LIDAR_SIM in features and FLAGS[version] > FeatureFlag.LIDAR_SIM:
         ids |= {SCAN}
     return frozenset(ids)
 
 
-def maps(version: str, features: Collection[Feature]) -> bool:
+def maps(version: str, features: Collection[FeatureFlag]) -> bool:
     """Tell whether a robot knows map and position: SLAMMap where the version has that flag, else Lidar."""
-    return (Feature.SLAM_MAP if FLAGS[version] > Feature.SLAM_MAP else Feature.LIDAR) in features
+    return (FeatureFlag.SLAM_MAP if FLAGS[version] > FeatureFlag.SLAM_MAP else FeatureFlag.LIDAR) in features
 
 
 def body_problem(kind: int, body: bytes) -> str:

@@ -1,13 +1,71 @@
-"""Conversations of the TCP/UDP package protocol, with the gateway in either role. Sans-IO.
+"""Conversations of the TCP/UDP package protocol: framing, ``id`` bytes and channels, as both roles share them. Sans-IO.
 
-:class:`HqRole` plays HQ towards a robot: its handshake is the table of ``hq_handshake``; ``registered`` decides what
-the robot may be sent. :class:`RobotRole` plays the robot towards an HQ program: its handshake is the table of
-``robot_role``; ``source`` decides whose datagrams count. ``packets`` is what both share: framing and ``id`` bytes.
+``hq_role`` plays HQ towards a robot, with the handshake of ``hq_handshake``; ``robot_role`` plays the robot towards an
+HQ program. Source: "Framing" and "Packets" of the protocol page.
 """
 
-from gateways.tcpudp.session.hq_role import HqRole
-from gateways.tcpudp.session.packets import limits
-from gateways.tcpudp.session.robot_role import RobotRole
-from gateways.tcpudp.session.source import CLIENT_PORT
+from __future__ import annotations
 
-__all__ = ["CLIENT_PORT", "HqRole", "RobotRole", "limits"]
+from collections.abc import Callable, Iterable
+
+from gateways.tcpudp.messages import (
+    MAX_FRAME,
+    PACKETS,
+    DebugMessage,
+    OpaquePacket,
+    Packet,
+    PacketSender,
+    decoder,
+    encode_packet,
+    frame_end,
+)
+from zbridge.protocol import Limits, ProtocolError, Role, Session
+
+HANDSHAKE_S = 5.0
+_QUOTED = 80
+_OWN = {Role.HQ: PacketSender.HQ, Role.ROBOT: PacketSender.ROBOT}
+
+Decode = Callable[[bytes, int], Packet]
+
+
+def limits(gap_s: float) -> Limits:
+    """Give the bounds of a session that leaves ``gap_s`` seconds between two packets."""
+    return Limits(frame_bytes=MAX_FRAME, handshake_s=HANDSHAKE_S, gap_s=gap_s)
+
+
+def decoders(role: Role) -> dict[int, Decode]:
+    """Tabulate, by packet id, how to read what the peer of ``role`` may send."""
+    own = _OWN[role]
+    return {
+        number: decoder(number) for number in range(256) if number not in PACKETS or PACKETS[number].sender is not own
+    }
+
+
+def id_of(message: Packet) -> int:
+    """Give the packet id of a packet, declared or not."""
+    return message.id if isinstance(message, OpaquePacket) else message.spec.id
+
+
+class PacketSession(Session[Packet]):
+    """A session that speaks packets."""
+
+    frame_end = staticmethod(frame_end)
+    sender_id: int
+    """The ``id`` byte of what the session sends."""
+
+    def encode(self, message: Packet) -> bytes:
+        return encode_packet(message, self.sender_id, self.transport)
+
+    def misplaced(self, frame: bytes) -> ProtocolError:
+        """Make the error for a packet that the peer may not send."""
+        sender_id, packet_id = frame[4], frame[5]
+        spec = PACKETS.get(packet_id)
+        if spec is not None and spec.sender is _OWN[self.role]:
+            return ProtocolError(f"{spec.name} ({packet_id}) from the wrong side")
+        return ProtocolError(f"packet {packet_id} with id {sender_id}, which is not the peer's")
+
+    def refuse_versions(self, listed: str, ours: Iterable[str], now: float) -> None:
+        """Close for lack of a common version, with a text to the peer ("Settings and version negotiation")."""
+        reason = f"no common version: the peer speaks {listed[:_QUOTED]!r}, this gateway {', '.join(ours)}"
+        self.send(DebugMessage(reason))
+        self.close(reason, now)

@@ -1,13 +1,25 @@
-"""The gateway plays the robot towards one HQ program. Sans-IO.
+"""The gateway plays the robot towards one HQ program, and decides whose datagrams are that program's. Sans-IO.
 
 Source: "Handshake", "Settings and version negotiation" and "The gateway as robot" of the protocol page.
 
-Theory of operation. The handshake is the table at the foot of this file: :class:`Step` says what the session waits for,
-:class:`Event` what can happen, and every row names the action that is taken. The session is ``established`` from the
-steps STREAM and DONE on. Datagrams are claimed in the steps PROBED, ANSWERED and DONE only; :class:`ClientSource`
-decides whose they are. The client's 7 never makes a source: 7(false) is reliable, 7(true) is not, as programs of 1.3
-always send it. A program that gets a 6 sends its 7 at once. So a 7 later than :data:`PROBE_S` after the 4 tells that
-the program got no 6: the 5 may have been somebody else's, and the source is dropped.
+Theory of operation. The handshake is the table at the foot of this file: :class:`RobotStep` says what the session waits
+for, :class:`RobotEvent` what can happen, and every row names the action that is taken. The session is ``established``
+from the steps STREAM and DONE on. Datagrams are claimed in the steps PROBED, ANSWERED and DONE only. The client's 7
+never makes a source: 7(false) is reliable, 7(true) is not, as programs of 1.3 always send it. A program that gets a 6
+sends its 7 at once. So a 7 later than :data:`PROBE_S` after the 4 shows that the program got no 6: the 5 may have been
+somebody else's, and the source is dropped.
+
+Any process of the HQ program's host can send datagrams, and only their source identifies them. A port becomes the
+client's source in two ways only:
+
+- by a 5 between our 4 and its 7 (:meth:`ClientSource.claims_probe`). If a second port sends a 5 too, the session
+  accepts datagrams of neither;
+- after the handshake, while the client has no source, by a packet with its id from the port that deployed programs bind
+  (:meth:`ClientSource.claims_late`): a program of 1.3 whose 5 was lost sends 11, 12 and 61 by UDP all the same. If it
+  has another source then, one of the two is not the client, and the session no longer accepts datagrams of either.
+
+The session calls :meth:`ClientSource.bind` with the first datagram that it is given, and :meth:`ClientSource.lose` when
+a rival shows up.
 """
 
 from __future__ import annotations
@@ -17,26 +29,15 @@ from collections.abc import Callable, Iterable
 from enum import Enum
 from typing import Any, ClassVar
 
-from gateways.tcpudp.messages import (
-    HEADER,
-    SERVER_ID,
-    ClientSettings,
-    ClientUDPConnection,
-    ClientUDPConnectionStatus,
-    Packet,
-    ServerSettings,
-    ServerStartUDP,
-    ServerUDPConnection,
-)
-from gateways.tcpudp.session.packets import PacketSession, id_of
-from gateways.tcpudp.session.source import CLIENT_PORT, FROM_HQ, ClientSource
-from gateways.tcpudp.settings import HQ_BLOCKS, SETTINGS, Settings, read_settings
-from gateways.tcpudp.versions import LISTED, VERSIONS
+from gateways.tcpudp import messages as packets
+from gateways.tcpudp.session import Decode, PacketSession, decoders, id_of
+from gateways.tcpudp.settings import HQ_BLOCKS, LISTED, SETTINGS, VERSIONS, Settings, read_settings
 from zbridge.protocol import (
     FRAME,
     Datagram,
     Exported,
     Handshake,
+    Kept,
     Limits,
     NotReady,
     ProtocolError,
@@ -48,17 +49,88 @@ from zbridge.protocol import (
     parse_versions,
 )
 
+CLIENT_PORT = 11000
+"""The UDP port that deployed HQ programs bind."""
+FROM_HQ: dict[int, Decode] = decoders(Role.ROBOT)
+"""How to read what an HQ program may send, by packet id."""
+_UNASSIGNED = (0, packets.SERVER_ID)
+"""The ``id`` bytes that no client is given."""
+_NO_HEADER = (-1, -1)
+_PROBE = packets.ClientUDPConnection.spec.id
+
+
+class ClientSource(Kept):
+    """The source of one client's datagrams. ``client_port``: the UDP port that it is known to bind; 0: none."""
+
+    kept: ClassVar[dict[str, Any]] = {"bound": bool, "_port": int, "_contested": bool}
+
+    def __init__(self, client_id: int, client_port: int) -> None:
+        self.client_port = client_port
+        self.bound = False
+        """True while datagrams come from a port that counts as the client's."""
+        self._client_id = client_id
+        self._port = 0
+        self._contested = False
+        """True once two ports claimed to be the client's after the handshake."""
+
+    def __repr__(self) -> str:
+        return f"<ClientSource of {self._client_id}: {self._port if self.bound else 'none'}>"
+
+    def claims_probe(self, datagram: bytes, port: int) -> bool:
+        """True for a 5 with the client's id or an unassigned one."""
+        sender_id, packet_id = _header(datagram)
+        own = sender_id == self._client_id or sender_id in _UNASSIGNED
+        return self._claim(port) if own and packet_id == _PROBE else False
+
+    def claims_late(self, datagram: bytes, port: int) -> bool:
+        """True for a packet with the client's id from its port, unless that is its source or was contested."""
+        if port != self.client_port or self._contested or (self.bound and self._port == port):
+            return False
+        sender_id, packet_id = _header(datagram)
+        return self._claim(port) if sender_id == self._client_id and packet_id in FROM_HQ else False
+
+    def bind(self) -> None:
+        """Take the port of the last claim for the client's."""
+        self.bound = True
+
+    def lose(self, *, for_good: bool = False) -> None:
+        """Have no source; ``for_good``: let none be claimed late."""
+        self.bound = False
+        self._contested = self._contested or for_good
+
+    def sender_of(self, datagram: bytes) -> int:
+        """Give the ``id`` byte of a datagram; -1 if it is no packet."""
+        return _header(datagram)[0]
+
+    def accepts_sender(self, sender_id: int) -> bool:
+        """True for the ``id`` bytes of the client's datagrams, and for -1, which decoding will refuse."""
+        return sender_id in (_NO_HEADER[0], self._client_id, *_UNASSIGNED)
+
+    def _claim(self, port: int) -> bool:
+        if not self.bound:
+            self._port = port
+        return True
+
+
+def _header(datagram: bytes) -> tuple[int, int]:
+    """Give the ``id`` byte and the packet id of a datagram; -1 each if it is not one packet."""
+    try:
+        return packets.read_header(datagram)
+    except ProtocolError:
+        return _NO_HEADER
+
+
 PROBE_S = 2.0
 """Seconds an HQ program has for its datagram 5."""
 REPORT_S = 3.0
 """Seconds it has for packet 7: it may wait 2 s for a 6 that was lost."""
 RIVAL = "another source of datagrams claims to be this client"
-_HEADER_SIZE = HEADER.size
+_HEADER_SIZE = packets.HEADER.size
 _HANDSHAKING, _ESTABLISHED = State.HANDSHAKING, State.ESTABLISHED
 """As plain names: every client of a host is asked about every datagram that has no owner yet."""
 
 
-class Step(Enum):
+class RobotStep(Enum):
     """What the handshake waits for."""
 
     GREETED = "sent 2, waits for 3"
@@ -69,7 +141,7 @@ class Step(Enum):
     DONE = "established after a 4"
 
 
-class Event(Enum):
+class RobotEvent(Enum):
     """What can happen in a handshake."""
 
     SETTINGS_UDP = "3, and both set the UDP flag"
@@ -102,8 +174,8 @@ class RobotRole(PacketSession):
         "_handshake": Handshake,
     }
     role = Role.ROBOT
-    handled = frozenset({ClientSettings, ClientUDPConnection, ClientUDPConnectionStatus})
-    sender_id = SERVER_ID
+    handled = frozenset({packets.ClientSettings, packets.ClientUDPConnection, packets.ClientUDPConnectionStatus})
+    sender_id = packets.SERVER_ID
 
     def __init__(
         self,
@@ -132,20 +204,20 @@ class RobotRole(PacketSession):
         """Packet 6, once it was queued."""
         self._report_until = -math.inf
         """Until when a 7(true) answers a 6 that was received."""
-        within_s = {Step.PROBED: PROBE_S, Step.ANSWERED: REPORT_S, Step.UNANSWERED: REPORT_S}
-        self._handshake = Handshake(self, TABLE, Step.GREETED, timeout=Event.TIMEOUT, within_s=within_s)
+        within_s = {RobotStep.PROBED: PROBE_S, RobotStep.ANSWERED: REPORT_S, RobotStep.UNANSWERED: REPORT_S}
+        self._handshake = Handshake(self, TABLE, RobotStep.GREETED, timeout=RobotEvent.TIMEOUT, within_s=within_s)
 
     def restore(self, state: Exported) -> None:
         super().restore(state)
         self._answer = self.outbox.found(self._answer)
 
-    def decode(self, frame: bytes) -> Packet:
+    def decode(self, frame: bytes) -> packets.Packet:
         decode = FROM_HQ.get(frame[5])
         if decode is None:
             raise self.misplaced(frame)
         return decode(frame, _HEADER_SIZE)
 
-    def may_send(self, message: Packet) -> None:
+    def may_send(self, message: packets.Packet) -> None:
         """Raise Unsupported for a packet that this HQ does not know."""
         if id_of(message) not in self.known:
             raise Unsupported(f"an HQ of version {self._agreed} does not know packet {id_of(message)}")
@@ -153,23 +225,23 @@ class RobotRole(PacketSession):
     # The stream
 
     def opened(self, now: float) -> None:
-        self.send_first(ServerSettings(self.client_id, ",".join(self._versions), self._block))
+        self.send_first(packets.ServerSettings(self.client_id, ",".join(self._versions), self._block))
 
-    def accept(self, message: Packet, now: float) -> bool:
-        if isinstance(message, ClientSettings):
+    def accept(self, message: packets.Packet, now: float) -> bool:
+        if isinstance(message, packets.ClientSettings):
             self._take_settings(message, now)
         elif self.client is None:
             raise ProtocolError(f"{type(message).__name__} before clientSettings")
-        elif isinstance(message, ClientUDPConnectionStatus):
-            heard = message.connected and now < self._report_until
-            self._fire(Event.REPORT_TRUE if heard else Event.REPORT_FALSE, now)
-        elif isinstance(message, ClientUDPConnection):
+        elif isinstance(message, packets.ClientUDPConnectionStatus):
+            confirmed = message.connected and now < self._report_until
+            self._fire(RobotEvent.REPORT_TRUE if confirmed else RobotEvent.REPORT_FALSE, now)
+        elif isinstance(message, packets.ClientUDPConnection):
             raise ProtocolError("clientUDPConnection by TCP")
         else:
             return True
         return False
 
-    def _take_settings(self, message: ClientSettings, now: float) -> None:
+    def _take_settings(self, message: packets.ClientSettings, now: float) -> None:
         if self.client is not None:
             raise ProtocolError("clientSettings a second time")
         agreed = agree(self._versions, parse_versions(message.versions))
@@ -180,7 +252,7 @@ class RobotRole(PacketSession):
         self._agreed = agreed
         row = newest((agreed,), known=VERSIONS)
         self.known = self._also_known | (VERSIONS[row].known_to_hq if row is not None else frozenset())
-        self._fire(Event.SETTINGS_UDP if self.settings.udp and self.client.udp else Event.SETTINGS_TCP, now)
+        self._fire(RobotEvent.SETTINGS_UDP if self.settings.udp and self.client.udp else RobotEvent.SETTINGS_TCP, now)
 
     # Datagrams
 
@@ -188,8 +260,8 @@ class RobotRole(PacketSession):
         """Claim a 5 between our 4 and its 7; later a packet with the client's id from its port."""
         step = self._handshake.step
         if self.state is _ESTABLISHED:
-            return step is Step.DONE and self._source.claims_late(datagram, port)
-        probed = self.state is _HANDSHAKING and (step is Step.PROBED or step is Step.ANSWERED)
+            return step is RobotStep.DONE and self._source.claims_late(datagram, port)
+        probed = self.state is _HANDSHAKING and (step is RobotStep.PROBED or step is RobotStep.ANSWERED)
         return probed and self._source.claims_probe(datagram, port)
 
     def rivalled(self, now: float) -> None:
@@ -199,27 +271,27 @@ class RobotRole(PacketSession):
         self._source.lose(for_good=established)
         self.transport = "tcp"
         if not established:
-            self._handshake.fire(Event.RIVAL, now)
+            self._handshake.fire(RobotEvent.RIVAL, now)
 
     def stray(self, datagram: bytes) -> None:
-        """Count a datagram with this client's id from an unknown port; raise NotReady with what to tell the client."""
+        """Count a datagram with this client's id from an unknown port; raise NotReady with a text for the client."""
         if self.state is State.ESTABLISHED and self._source.sender_of(datagram) == self.client_id:
             self.traffic.foreign += 1
             text = "packets by UDP from another port than this client's are not taken"
             raise NotReady(f"{text} (client_port = {self._source.client_port})")
 
-    def receive_datagram(self, datagram: bytes, now: float) -> list[Packet]:
-        """Take one datagram of the client's source, unless it bears the id of another client."""
+    def receive_datagram(self, datagram: bytes, now: float) -> list[packets.Packet]:
+        """Take one datagram of the client's source, unless it has the id of another client."""
         self._source.bind()
         sender_id = self._source.sender_of(datagram)
-        if self._source.may_bear(sender_id):
+        if self._source.accepts_sender(sender_id):
             return super().receive_datagram(datagram, now)
         self.malformed(f"datagram with id {sender_id}, which is another client's")
         return []
 
-    def accept_datagram(self, message: Packet, now: float) -> bool:
-        if isinstance(message, ClientUDPConnection):
-            self._fire(Event.PROBE, now)
+    def accept_datagram(self, message: packets.Packet, now: float) -> bool:
+        if isinstance(message, packets.ClientUDPConnection):
+            self._fire(RobotEvent.PROBE, now)
             return False
         if self.state is not State.ESTABLISHED:  # until the 7 the source may be somebody else's
             raise ProtocolError(f"{type(message).__name__} by UDP before the handshake is over")
@@ -235,7 +307,7 @@ class RobotRole(PacketSession):
 
     # Actions of the table
 
-    def _fire(self, event: Event, now: float) -> None:
+    def _fire(self, event: RobotEvent, now: float) -> None:
         """Take a message of the handshake; raise ProtocolError if it is not due."""
         if not self._handshake.fire(event, now):
             raise ProtocolError(f"{_MESSAGES[event]} was not due")
@@ -243,13 +315,13 @@ class RobotRole(PacketSession):
     def _offer_udp(self, now: float) -> None:
         """Send 4; the time limit of the settings ends."""
         self.lift_limit()
-        self.send_first(ServerStartUDP())
+        self.send_first(packets.ServerStartUDP())
         self._report_until = now + PROBE_S
 
     def _answer_probe(self, now: float) -> None:
         """Send 6(true) by UDP to the source of the 5."""
         self.transport = "udp"
-        self._answer = Datagram(self.encode(ServerUDPConnection(True)))
+        self._answer = Datagram(self.encode(packets.ServerUDPConnection(True)))
         self.outbox.put_exempt(self._answer)
 
     def _send_no_answer(self, now: float) -> None:
@@ -276,34 +348,34 @@ class RobotRole(PacketSession):
 
 
 _MESSAGES = {
-    Event.PROBE: "clientUDPConnection",
-    Event.REPORT_TRUE: "clientUDPConnectionStatus",
-    Event.REPORT_FALSE: "clientUDPConnectionStatus",
+    RobotEvent.PROBE: "clientUDPConnection",
+    RobotEvent.REPORT_TRUE: "clientUDPConnectionStatus",
+    RobotEvent.REPORT_FALSE: "clientUDPConnectionStatus",
 }
-TABLE: dict[Step, dict[Event, tuple[Callable[[RobotRole, float], None], Step]]] = {
-    Step.GREETED: {
-        Event.SETTINGS_UDP: (RobotRole._offer_udp, Step.PROBED),
-        Event.SETTINGS_TCP: (RobotRole._finish, Step.STREAM),
+TABLE: dict[RobotStep, dict[RobotEvent, tuple[Callable[[RobotRole, float], None], RobotStep]]] = {
+    RobotStep.GREETED: {
+        RobotEvent.SETTINGS_UDP: (RobotRole._offer_udp, RobotStep.PROBED),
+        RobotEvent.SETTINGS_TCP: (RobotRole._finish, RobotStep.STREAM),
     },
-    Step.PROBED: {
-        Event.PROBE: (RobotRole._answer_probe, Step.ANSWERED),
-        Event.TIMEOUT: (RobotRole._send_no_answer, Step.UNANSWERED),
-        Event.RIVAL: (RobotRole._send_no_answer, Step.UNANSWERED),
-        Event.REPORT_TRUE: (RobotRole._finish, Step.DONE),
-        Event.REPORT_FALSE: (RobotRole._drop_source, Step.DONE),
+    RobotStep.PROBED: {
+        RobotEvent.PROBE: (RobotRole._answer_probe, RobotStep.ANSWERED),
+        RobotEvent.TIMEOUT: (RobotRole._send_no_answer, RobotStep.UNANSWERED),
+        RobotEvent.RIVAL: (RobotRole._send_no_answer, RobotStep.UNANSWERED),
+        RobotEvent.REPORT_TRUE: (RobotRole._finish, RobotStep.DONE),
+        RobotEvent.REPORT_FALSE: (RobotRole._drop_source, RobotStep.DONE),
     },
-    Step.ANSWERED: {
-        Event.RIVAL: (RobotRole._reject_both, Step.UNANSWERED),
-        Event.REPORT_TRUE: (RobotRole._finish, Step.DONE),
-        Event.REPORT_FALSE: (RobotRole._drop_source, Step.DONE),
-        Event.TIMEOUT: (RobotRole._drop_source, Step.DONE),
+    RobotStep.ANSWERED: {
+        RobotEvent.RIVAL: (RobotRole._reject_both, RobotStep.UNANSWERED),
+        RobotEvent.REPORT_TRUE: (RobotRole._finish, RobotStep.DONE),
+        RobotEvent.REPORT_FALSE: (RobotRole._drop_source, RobotStep.DONE),
+        RobotEvent.TIMEOUT: (RobotRole._drop_source, RobotStep.DONE),
     },
-    Step.UNANSWERED: {
-        Event.RIVAL: (RobotRole._send_no_answer, Step.UNANSWERED),
-        Event.REPORT_TRUE: (RobotRole._finish, Step.DONE),
-        Event.REPORT_FALSE: (RobotRole._drop_source, Step.DONE),
-        Event.TIMEOUT: (RobotRole._drop_source, Step.DONE),
+    RobotStep.UNANSWERED: {
+        RobotEvent.RIVAL: (RobotRole._send_no_answer, RobotStep.UNANSWERED),
+        RobotEvent.REPORT_TRUE: (RobotRole._finish, RobotStep.DONE),
+        RobotEvent.REPORT_FALSE: (RobotRole._drop_source, RobotStep.DONE),
+        RobotEvent.TIMEOUT: (RobotRole._drop_source, RobotStep.DONE),
     },
-    Step.STREAM: {},
-    Step.DONE: {},
+    RobotStep.STREAM: {},
+    RobotStep.DONE: {},
 }

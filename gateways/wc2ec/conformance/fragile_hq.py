@@ -10,9 +10,9 @@ from collections.abc import Iterable
 from typing import NoReturn, Unpack
 
 from gateways.wc2ec.conformance import parser as wire
-from gateways.wc2ec.conformance.parser import ControllerReader, Dialect, Message
-from zbridge.simulation.fragile import Work, log_violations
-from zbridge.simulation.hq_program import HqProgram, run_hq_program
+from gateways.wc2ec.conformance.parser import ControllerReader, Dialect, ParsedWc2EcMessage
+from zbridge.simulation.fragile import Work
+from zbridge.simulation.hq_program import HqProgram
 from zbridge.simulation.judge import Bounds, Ended, show
 
 MOTOR_TYPES = (53, 46)
@@ -22,7 +22,7 @@ WHEEL_RAD_S = 10.0
 _SPLIT_S = 0.002
 
 
-class FragileController(HqProgram):
+class FragileExternalController(HqProgram):
     """One start of an external controller: records every violation and dies of the deadly ones.
 
     ``split``: it writes a command field by field; ``flight_s``: how long after a disableSensor data may still come. A
@@ -169,7 +169,7 @@ class FragileController(HqProgram):
 
     # Messages
 
-    def _receive(self, message: Message) -> None:
+    def _receive(self, message: ParsedWc2EcMessage) -> None:
         value, raw = message.value, show(message.raw)
         self.received.append((time.monotonic(), message.command, message.node_type, message.number, value))
         self._report(message.problem, raw, deadly=message.deadly)
@@ -180,7 +180,7 @@ class FragileController(HqProgram):
         else:
             self._event(f"error: {raw}")  # "sent by nobody; harmless"
 
-    def _register(self, message: Message, name: str, raw: str) -> None:
+    def _register(self, message: ParsedWc2EcMessage, name: str, raw: str) -> None:
         """Take a registration ("Register each name once (a duplicate kills the deployed EC)"; "index (0..254)")."""
         number = message.number
         if name in self._names:
@@ -196,7 +196,7 @@ class FragileController(HqProgram):
         self._names.add(name)
         self.devices[number] = message.node_type, name
 
-    def _measure(self, message: Message, value: float, raw: str) -> None:
+    def _measure(self, message: ParsedWc2EcMessage, value: float, raw: str) -> None:
         number = message.number
         if self.dialect == "draft":
             self._unasked(number, raw)
@@ -216,13 +216,3 @@ class FragileController(HqProgram):
         disabled_s = time.monotonic() - self._disabled.get(number, -math.inf)
         if number not in self.enabled and disabled_s > self._flight_s:
             self._violate(f"data of sensor {number}, which is not enabled: {raw}")
-
-
-async def simulate_fragile_hq(
-    host: str, port: int, *, dialect: Dialect, split: bool = False, drive: tuple[float, float] | None = None
-) -> None:
-    """Run a fragile external controller until cancelled, dead or left; log each violation, and print what it does.
-
-    drive: forward and turn, fractions of full scale; None: it sets no motor. Raise OSError if nobody listens.
-    """
-    await run_hq_program(FragileController(dialect=dialect, split=split, note=log_violations()), host, port, drive)

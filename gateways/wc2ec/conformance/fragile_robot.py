@@ -5,23 +5,30 @@ from __future__ import annotations
 import asyncio
 import socket
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NoReturn, Unpack
 
 from gateways.wc2ec.conformance import parser as wire
-from gateways.wc2ec.conformance.machine import Motor, Robot
-from gateways.wc2ec.conformance.parser import DEFAULT, Device, Dialect, Message, Reader, Times
-from zbridge.simulation.fragile import FragileServer, log_violations, simulate
+from gateways.wc2ec.conformance.machine import JudgedMotor, JudgedWebots
+from gateways.wc2ec.conformance.parser import (
+    DEFAULT,
+    Dialect,
+    ExternalReader,
+    ParsedWc2EcMessage,
+    SimulatedDevice,
+    Wc2EcTimes,
+)
+from zbridge.simulation.fragile import FragileServer
 from zbridge.simulation.judge import Bounds, Chances, Ended, show
 from zbridge.simulation.sockets import drain, reset_on_close
 from zbridge.simulation.timing import Ticker
 
 _MOST_MOVE_S = 0.1
 """Longest time for which the robot moves in one step, however late it is."""
-_DEPLOYED = Times()
+_DEPLOYED = Wc2EcTimes()
 
 
-class FragileController(FragileServer):
+class FragileWebotsController(FragileServer):
     """One start of a simulation: serves one external controller, records every violation, dies of the deadly ones.
 
     It ends when its external controller leaves ("Roles"). ``devices``: default those of ``DEFAULT``; ``values``:
@@ -30,16 +37,16 @@ class FragileController(FragileServer):
     """
 
     KEEP = 100_000
-    _reader: Reader
+    _reader: ExternalReader
 
     def __init__(
         self,
         dialect: Dialect,
         *,
-        devices: Sequence[Device] | None = None,
+        devices: Sequence[SimulatedDevice] | None = None,
         seed: int = 1,
         values: int = 3,
-        times: Times = _DEPLOYED,
+        times: Wc2EcTimes = _DEPLOYED,
         **bounds: Unpack[Bounds],
     ) -> None:
         if dialect not in DEFAULT:
@@ -49,10 +56,10 @@ class FragileController(FragileServer):
         self.devices = tuple(DEFAULT[dialect] if devices is None else devices)
         wire.check(dialect, self.devices)
         chance = Chances(seed)
-        self.robot = Robot(self.devices, chance["robot"], values)
+        self.robot = JudgedWebots(self.devices, chance["robot"], values)
         self.registered = dialect == "draft"
         """Whether the last registration was sent."""
-        self._reader = Reader(dialect, self.devices, values)
+        self._reader = ExternalReader(dialect, self.devices, values)
         self._times, self._cuts = times, chance["cuts"]
         self._part_s, self._part_noted = 0.0, False
 
@@ -60,13 +67,13 @@ class FragileController(FragileServer):
         return "OVER" if self._over.is_set() else "LISTENING" if self._conn is None else "CONNECTED"
 
     @property
-    def motors(self) -> dict[str, Motor]:
+    def motors(self) -> dict[str, JudgedMotor]:
         """The motors by name, as they are now."""
         return self.robot.motors
 
     @property
     def stuck(self) -> bool:
-        """Whether it takes no command any more, because of a 130 to no motor."""
+        """Whether it obeys no more commands, because of a 130 to no motor."""
         return self._reader.blocked
 
     async def cut(self) -> None:
@@ -139,7 +146,7 @@ class FragileController(FragileServer):
             self._part_noted = True
             self._violate(f"part of a command, and no more for {self._part_s:.2f} s: {show(self._reader.rest)}")
 
-    def _receive(self, message: Message) -> None:
+    def _receive(self, message: ParsedWc2EcMessage) -> None:
         self.received.append((time.monotonic(), message.command, message.node_type, message.number, message.value))
         raw = show(message.raw)
         if not self.registered and not message.deadly:
@@ -150,21 +157,3 @@ class FragileController(FragileServer):
             self.robot.set_motor(message)
         elif needless := self.robot.set_sensor(message):
             self._event(needless)
-
-
-async def simulate_fragile(
-    host: str,
-    port: int,
-    *,
-    dialect: Dialect,
-    seed: int,
-    ready: Callable[[int], None],
-    devices: Sequence[Device] | None = None,
-    times: Times = _DEPLOYED,
-) -> None:
-    """Run a fragile controller until its external controller left, dead or cancelled; log each violation.
-
-    It prints why it ended, if it was not cancelled. ``ready`` is called with the port once it listens.
-    """
-    controller = FragileController(dialect, devices=devices, seed=seed, times=times, note=log_violations())
-    await simulate(controller, host, port, ready)

@@ -35,7 +35,7 @@ _HEADER, _FLOAT = 3, struct.Struct("<BBBd")
 _COMMANDS = {"deployed": (SET_VALUE,), "draft": (ENABLE, DISABLE, CHANGE, SET)}
 
 
-class Kind(enum.Enum):
+class DeviceKind(enum.Enum):
     """What a device is for the deployed controller, whatever its Webots node type ("the numbers move")."""
 
     DISTANCE = enum.auto()
@@ -45,32 +45,32 @@ class Kind(enum.Enum):
     OTHER = enum.auto()
 
 
-class Device(msgspec.Struct, frozen=True):
+class SimulatedDevice(msgspec.Struct, frozen=True):
     """One device of the robot."""
 
     name: str
     number: int
     node_type: int
-    kind: Kind
+    kind: DeviceKind
 
     @property
     def motor(self) -> bool:
         """Whether 130 may be sent to it."""
-        return self.kind in (Kind.ROTATIONAL, Kind.LINEAR)
+        return self.kind in (DeviceKind.ROTATIONAL, DeviceKind.LINEAR)
 
 
-DEFAULT: dict[Dialect, tuple[Device, ...]] = {
+DEFAULT: dict[Dialect, tuple[SimulatedDevice, ...]] = {
     "deployed": (
-        *(Device(f"ds{number}", number, 37, Kind.DISTANCE) for number in range(8)),
-        Device("left wheel motor", 8, 53, Kind.ROTATIONAL),
-        Device("right wheel motor", 9, 53, Kind.ROTATIONAL),
-        Device("lift", 10, 46, Kind.LINEAR),
+        *(SimulatedDevice(f"ds{number}", number, 37, DeviceKind.DISTANCE) for number in range(8)),
+        SimulatedDevice("left wheel motor", 8, 53, DeviceKind.ROTATIONAL),
+        SimulatedDevice("right wheel motor", 9, 53, DeviceKind.ROTATIONAL),
+        SimulatedDevice("lift", 10, 46, DeviceKind.LINEAR),
     ),
-    "draft": tuple(Device(f"light{number}", number, LIGHT_TYPE, Kind.LIGHT) for number in range(4)),
+    "draft": tuple(SimulatedDevice(f"light{number}", number, LIGHT_TYPE, DeviceKind.LIGHT) for number in range(4)),
 }
 
 
-class Times(msgspec.Struct, frozen=True, kw_only=True):
+class Wc2EcTimes(msgspec.Struct, frozen=True, kw_only=True):
     """The controller's times in seconds, and how patient the judge is."""
 
     step_s: float = 0.02
@@ -83,7 +83,7 @@ class Times(msgspec.Struct, frozen=True, kw_only=True):
     """Longest time one round of data may take to send."""
 
 
-class Message(msgspec.Struct, frozen=True):
+class ParsedWc2EcMessage(msgspec.Struct, frozen=True):
     """One message: header and value, what is wrong with it, and whether it kills or blocks the judge."""
 
     command: int
@@ -96,20 +96,20 @@ class Message(msgspec.Struct, frozen=True):
     blocks: bool = False
 
 
-def check(dialect: Dialect, devices: Collection[Device]) -> None:
+def check(dialect: Dialect, devices: Collection[SimulatedDevice]) -> None:
     """Refuse devices that a controller cannot have with ValueError ("Dialect ...", "Register each name once")."""
     for device in devices:
         if not 0 <= device.number <= MOST_NUMBER or not 0 <= device.node_type <= 255:
             raise ValueError(f"{device!r}: number or type out of range")
         if len(device.name.encode()) > _NAME_BYTES:
             raise ValueError(f"a name of {len(device.name.encode())} bytes")
-        if dialect == "draft" and (device.kind is not Kind.LIGHT or device.node_type != LIGHT_TYPE):
+        if dialect == "draft" and (device.kind is not DeviceKind.LIGHT or device.node_type != LIGHT_TYPE):
             raise ValueError(f"{device!r}: the draft has light sensors only")
     if len({device.number for device in devices}) < len(devices) or len({one.name for one in devices}) < len(devices):
         raise ValueError("two devices with one name or number")
 
 
-class _Reader(MessageReader[Message]):
+class _Wc2EcReader(MessageReader[ParsedWc2EcMessage]):
     """Cuts the stream of either side ("no length, the body follows from command and type")."""
 
     def __init__(self, dialect: Dialect) -> None:
@@ -128,26 +128,26 @@ class _Reader(MessageReader[Message]):
         """Tell why a command is not to be framed, empty if it is known."""
         raise NotImplementedError
 
-    def _lose(self, problem: str, after: int) -> Message:
+    def _lose(self, problem: str, after: int) -> ParsedWc2EcMessage:
         command, node_type, number = [*self.rest[:_HEADER], NO_FIELD, NO_FIELD][:_HEADER]
         self.dead = True
-        return Message(command, node_type, number, None, self.rest, problem, deadly=True)
+        return ParsedWc2EcMessage(command, node_type, number, None, self.rest, problem, deadly=True)
 
 
-class Reader(_Reader):
+class ExternalReader(_Wc2EcReader):
     """Cuts and judges the stream of an external controller, one read at a time.
 
     What it cannot frame it throws away with the rest of the read. ``blocked``: a 130 went to no motor, and "every later
     command is stuck". ``values``: how many configuration values a sensor of the draft has.
     """
 
-    def __init__(self, dialect: Dialect, devices: Collection[Device], values: int) -> None:
+    def __init__(self, dialect: Dialect, devices: Collection[SimulatedDevice], values: int) -> None:
         super().__init__(dialect)
         self.blocked = False
         self._values = values
         self._devices = {device.number: device for device in devices}
 
-    def take(self, data: bytes) -> list[Message]:
+    def take(self, data: bytes) -> list[ParsedWc2EcMessage]:
         """Read the commands that end in ``data``, which is one read of the controller."""
         commands = super().take(data)
         if self.dead:
@@ -159,7 +159,7 @@ class Reader(_Reader):
             return f"command {command}, which is of the controller's half"
         return "" if command in _COMMANDS[self._dialect] else f"unknown command {command}"
 
-    def _lose(self, problem: str, after: int) -> Message:
+    def _lose(self, problem: str, after: int) -> ParsedWc2EcMessage:
         lost = super()._lose(problem, after)
         self.dead, self.rest = after > 0, b""
         if self.dead:
@@ -171,12 +171,12 @@ class Reader(_Reader):
             return _FLOAT.size
         return _HEADER + {ENABLE: 0, DISABLE: 0, CHANGE: 9, SET: 8 * self._values}[data[0]]
 
-    def _read(self, raw: bytes) -> Message:
+    def _read(self, raw: bytes) -> ParsedWc2EcMessage:
         message = self._deployed(raw) if self._dialect == "deployed" else self._draft(raw)
         self.dead = self.blocked = message.blocks
         return message
 
-    def _deployed(self, raw: bytes) -> Message:
+    def _deployed(self, raw: bytes) -> ParsedWc2EcMessage:
         """Judge a setValue ("send 130 only to registered motors"; "NaN and infinities")."""
         command, node_type, number, value = _FLOAT.unpack(raw)
         device = self._devices.get(number)
@@ -188,10 +188,12 @@ class Reader(_Reader):
             problem = f"130 to type {node_type} number {number}: {device.name!r} is of type {device.node_type}"
         else:
             problem = "" if math.isfinite(value) else f"{value} to motor {device.name!r}"
-            return Message(command, node_type, number, value, raw, problem)
-        return Message(command, node_type, number, value, raw, f"{problem}: every later command is stuck", blocks=True)
+            return ParsedWc2EcMessage(command, node_type, number, value, raw, problem)
+        return ParsedWc2EcMessage(
+            command, node_type, number, value, raw, f"{problem}: every later command is stuck", blocks=True
+        )
 
-    def _draft(self, raw: bytes) -> Message:
+    def _draft(self, raw: bytes) -> ParsedWc2EcMessage:
         command, node_type, number = raw[:_HEADER]
         value: Value = None
         floats: tuple[float, ...] = ()
@@ -207,10 +209,10 @@ class Reader(_Reader):
             problem = f"command {command} to light sensor {number}, which is not there"
         elif not all(map(math.isfinite, floats)):
             problem = f"a configuration value that is no number, {floats}"
-        return Message(command, node_type, number, value, raw, problem)
+        return ParsedWc2EcMessage(command, node_type, number, value, raw, problem)
 
 
-class ControllerReader(_Reader):
+class ControllerReader(_Wc2EcReader):
     """Cuts the stream of a Webots controller; nothing can be read after what has no length."""
 
     def _unknown(self, command: int) -> str:
@@ -226,23 +228,23 @@ class ControllerReader(_Reader):
             return _HEADER
         return _HEADER + 1 + (data[_HEADER] if len(data) > _HEADER else 0)
 
-    def _read(self, raw: bytes) -> Message:
+    def _read(self, raw: bytes) -> ParsedWc2EcMessage:
         command, node_type, number = raw[:_HEADER]
         value: Value = None
         if command == DATA[self._dialect]:
             value = _FLOAT.unpack(raw)[3]
         elif command == REGISTER:
             value = raw[_HEADER + 1 :].decode("utf-8", "backslashreplace")
-        return Message(command, node_type, number, value, raw)
+        return ParsedWc2EcMessage(command, node_type, number, value, raw)
 
 
-def registration(device: Device) -> bytes:
+def registration(device: SimulatedDevice) -> bytes:
     """Write a registration ("Dialect `deployed`" 0)."""
     name = device.name.encode()
     return struct.pack("<BBBB", REGISTER, device.node_type, device.number, len(name)) + name
 
 
-def measurement(dialect: Dialect, device: Device, value: float) -> bytes:
+def measurement(dialect: Dialect, device: SimulatedDevice, value: float) -> bytes:
     """Write sensorData ("Dialect `deployed`" 1, "Dialect `draft`" 0)."""
     return _FLOAT.pack(DATA[dialect], device.node_type, device.number, value)
 

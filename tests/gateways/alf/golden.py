@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from gateways.alf.messages import (
+    AlfDialect,
     AlfMessage,
-    Dialect,
     DriveCommand,
     DriveInfo,
     End,
@@ -17,10 +17,10 @@ from gateways.alf.messages import (
     write_binary,
     write_text,
 )
-from gateways.alf.session import AlfSession, HqRole, VehicleRole
+from gateways.alf.session import AlfHqRole, AlfSession, VehicleRole
 from tests.conformance.side import Receive, Side, plain
 
-TEXT, BINARY = Dialect.TEXT, Dialect.BINARY
+TEXT, BINARY = AlfDialect.TEXT, AlfDialect.BINARY
 OF_VEHICLE, OF_HQ = frozenset({1, 2, 4, 255}), frozenset({3, 255})
 ALL = OF_VEHICLE | OF_HQ
 
@@ -43,7 +43,7 @@ MOVES = {
     TEXT: DriveInfo(10, 0.25, -0.5, 0.987654, 1.5, -2.75, 123.456001, 36.529999),
     BINARY: DriveInfo(10, 250, -500, 1000, 15, -27, 1234, 36.5),
 }
-GOLDEN: dict[Dialect, list[tuple[AlfMessage, bytes]]] = {
+GOLDEN: dict[AlfDialect, list[tuple[AlfMessage, bytes]]] = {
     TEXT: [
         (Measurement(7, 5000, np.array([1000, 0, 2147483647]), 1, 2), b"1|7|5000|1000|0|2147483647|1|2;"),
         (ScannerInit(-135.0, 119.882812, 0.351562, 100, 20, 5600), INIT[TEXT]),
@@ -66,7 +66,7 @@ GOLDEN: dict[Dialect, list[tuple[AlfMessage, bytes]]] = {
 }
 
 
-def session(kind: type[AlfSession], dialect: Dialect, *, points: int = 3, **options: Any) -> Any:
+def session(kind: type[AlfSession], dialect: AlfDialect, *, points: int = 3, **options: Any) -> Any:
     made = kind(dialect, points=points, **options)
     made.open(0.0)
     return made
@@ -76,9 +76,9 @@ def heard(by: AlfSession, *reads: bytes) -> list[list[Any]]:
     return [plain(message) for read in reads for message in by.receive(read, 0.0)]
 
 
-def _side(kind: type[AlfSession], dialect: Dialect) -> Side:
+def _side(kind: type[AlfSession], dialect: AlfDialect) -> Side:
     """What ``kind`` is sent."""
-    sender, ids = ("vehicle", OF_VEHICLE) if kind is HqRole else ("hq", OF_HQ)
+    sender, ids = ("vehicle", OF_VEHICLE) if kind is AlfHqRole else ("hq", OF_HQ)
     read, write = (read_text, write_text) if dialect is TEXT else (read_binary, write_binary)
 
     def receiver() -> Receive:
@@ -91,11 +91,11 @@ def _side(kind: type[AlfSession], dialect: Dialect) -> Side:
         lambda frame: read(frame, ids),
         write,
         receiver,
-        {Measurement, ScannerInit, DriveInfo, End} if kind is HqRole else {DriveCommand, End},
+        {Measurement, ScannerInit, DriveInfo, End} if kind is AlfHqRole else {DriveCommand, End},
         # a binary measurement of another number of points: the session knows how many there must be
         lambda _, frame: dialect is BINARY and frame[0] == 1 and len(frame) >= 17 and (len(frame) - 17) % 8 == 0,
         ends=(End(),),
     )
 
 
-SIDES = [_side(kind, dialect) for dialect in Dialect for kind in (HqRole, VehicleRole)]
+SIDES = [_side(kind, dialect) for dialect in AlfDialect for kind in (AlfHqRole, VehicleRole)]

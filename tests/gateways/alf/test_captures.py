@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from gateways.alf.hq import AlfHq, HqOptions
+from gateways.alf.hq import AlfHq, AlfHqOptions
 from gateways.alf.messages import DriveCommand
-from gateways.alf.session import HqRole
-from gateways.alf.translate import AlfRobot, Options
+from gateways.alf.session import AlfHqRole
+from gateways.alf.translate import AlfOptions, AlfRobot
 from tests.captures import payloads, stream
 from tests.gateways.alf.golden import END, TEXT
 from tests.gateways.rig import HqScene, drained
@@ -36,7 +36,7 @@ def told(robot: AlfRobot, name: str, port: int) -> list[tuple[Topic, FleetMessag
 
 
 def test_the_gateway_as_hq_drives_as_the_recorded_hq_did_and_answers_the_end() -> None:
-    link = HqRole(TEXT, drives=DriveCommand(0, 0, 0, False))
+    link = AlfHqRole(TEXT, drives=DriveCommand(0, 0, 0, False))
     link.open(0.0006)
     sent: list[bytes] = []
     now = 0.0006
@@ -53,7 +53,7 @@ def test_the_gateway_as_hq_drives_as_the_recorded_hq_did_and_answers_the_end() -
 
 def test_the_recorded_scanner_and_its_measurements_are_in_radians_seconds_and_metres() -> None:
     metrics = Metrics()
-    (topic, scanner), *scans = told(AlfRobot(Options(), 2, metrics), LASER, LASER_PORT)
+    (topic, scanner), *scans = told(AlfRobot(AlfOptions(), 2, metrics), LASER, LASER_PORT)
     assert topic is topics.SCANNER
     assert scanner.angle_min == pytest.approx(-2.356194490192345)  # -135 degrees
     assert scanner.angle_max == pytest.approx(2.092349785949368)  # 119.882812 degrees
@@ -77,7 +77,7 @@ def test_the_recorded_scanner_and_its_measurements_are_in_radians_seconds_and_me
 
 
 def test_the_recorded_drive_infos_are_motions_in_si_units() -> None:
-    motions = told(AlfRobot(Options(), 2), DRIVE, DRIVE_PORT)
+    motions = told(AlfRobot(AlfOptions(), 2), DRIVE, DRIVE_PORT)
     arrived_us = (300, 300_600, 800_900, 1_301_100, 1_801_500, 2_301_700)
     forward_m_s2 = (2.4516625, 12.2583125, 22.0649625, 31.8716125, 41.6782625, 51.4849125)  # n + 0.25 times 9.80665
     for number, (topic, motion) in enumerate(motions):
@@ -90,7 +90,7 @@ def test_the_recorded_drive_infos_are_motions_in_si_units() -> None:
 
 
 def test_the_recorded_hq_says_neutral_and_then_drives_to_the_right() -> None:
-    scene = HqScene(AlfHq(HqOptions(), RobotView()), RobotView())
+    scene = HqScene(AlfHq(AlfHqOptions(), RobotView()), RobotView())
     scene.connect()
     said = scene.says(stream(DRIVE, destination=DRIVE_PORT))
     neutral, right = Drive(light=False), Drive(forward=80 / 255, turn=-30 / 90, light=True)
@@ -101,10 +101,10 @@ def test_the_recorded_hq_says_neutral_and_then_drives_to_the_right() -> None:
 def test_what_a_recorded_vehicle_sent_passes_the_bus_and_reaches_an_hq_as_it_was(name: str, port: int) -> None:
     """All but the points outside the valid indices: on the bus they have no range, here they are 0."""
     view = RobotView()
-    scene = HqScene(AlfHq(HqOptions(serve="both"), view), view)
+    scene = HqScene(AlfHq(AlfHqOptions(serve="both"), view), view)
     client = scene.connect()
     shown = b""
-    for topic, telemetry in told(AlfRobot(Options(), 2), name, port):
+    for topic, telemetry in told(AlfRobot(AlfOptions(), 2), name, port):
         carried = fleet_payload.decode(topic.message, fleet_payload.encode(telemetry))
         view.note(topic, carried)
         scene.send(scene.side.show(topic, carried))

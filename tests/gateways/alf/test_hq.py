@@ -11,11 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from gateways.alf import hq as module
+from gateways.alf import messages
 from gateways.alf.conformance import parser
 from gateways.alf.conformance.parser import VehicleReader as Reader
-from gateways.alf.hq import AlfHq, HqOptions
-from gateways.alf.messages import AlfMessage, Dialect, write_text
+from gateways.alf.hq import AlfHq, AlfHqOptions
+from gateways.alf.messages import AlfDialect, AlfMessage, write_text
 from tests.gateways.alf.golden import BINARY, END, INIT, TEXT
 from tests.gateways.rig import HqScene, drained
 from zbridge.errors import EncodeError, ProtocolError
@@ -53,10 +53,10 @@ EIGHT = Scanner(-math.pi, 0.75 * math.pi, math.pi / 4, 0.05, 0.02, 5.6, 8)
 class Scene(HqScene):
     """One listener, what is known of its robot, and its clients."""
 
-    def __init__(self, dialect: Dialect = TEXT, *, protocol: str = "alf", clients: int = 1, **options: Any) -> None:
+    def __init__(self, dialect: AlfDialect = TEXT, *, protocol: str = "alf", clients: int = 1, **options: Any) -> None:
         view = RobotView()
         view.note(topics.STATUS, Status("established", protocol=protocol))
-        settings = HqOptions(**{"serve": "both", "dialect": dialect.value, **options})
+        settings = AlfHqOptions(**{"serve": "both", "dialect": dialect.value, **options})
         super().__init__(AlfHq(settings, view), view)
         for _ in range(clients):
             self.connect()
@@ -93,8 +93,8 @@ def fields_of(frame: bytes) -> list[float]:
 
 
 @pytest.mark.parametrize("known", [[SCANNER], [SCAN, SCANNER]])
-@pytest.mark.parametrize("dialect", Dialect)
-def test_a_client_is_sent_the_cached_scanner_init_before_anything_else(dialect: Dialect, known: list[Any]) -> None:
+@pytest.mark.parametrize("dialect", AlfDialect)
+def test_a_client_is_sent_the_cached_scanner_init_before_anything_else(dialect: AlfDialect, known: list[Any]) -> None:
     scene = Scene(dialect, clients=0)
     scene.tell(*known)
     client = scene.connect()
@@ -231,7 +231,7 @@ vectors = st.none() | st.tuples(anything, anything, anything)
 motions = st.builds(Motion, st.none() | anything, vectors, vectors, st.none() | anything)
 
 
-@pytest.mark.parametrize("dialect", Dialect)
+@pytest.mark.parametrize("dialect", AlfDialect)
 @given(history=st.lists(scans | scanners | motions, max_size=8), points=st.sampled_from([2, 12, 769]))
 def test_whatever_is_on_the_bus_deployed_receivers_break_on_nothing(dialect, history, points) -> None:
     """An ``EncodeError`` or ``ProtocolError`` is what a listener counts; it sends nothing then."""
@@ -311,9 +311,9 @@ def test_a_turn_without_speed_sets_the_wheels_and_is_no_motion() -> None:
     ],
 )
 def test_a_listener_serves_what_it_was_told_to_and_one_of_the_laser_takes_no_drives(options, kinds, driving) -> None:
-    """By default the laser until a client drives, from then on drive info: no deployed program bears both."""
+    """By default the laser until a client drives, from then on drive info: no deployed program tolerates both."""
     scene = Scene(clients=0)
-    scene.side = AlfHq(HqOptions(**options), scene.view)
+    scene.side = AlfHq(AlfHqOptions(**options), scene.view)
     scene.tell(SCANNER, SCAN)
     client = scene.connect()
     scene.connect()
@@ -339,8 +339,8 @@ def test_what_waited_of_the_laser_is_not_sent_to_a_client_that_drives() -> None:
 
 
 @pytest.mark.parametrize("ended_by_hq", [False, True])
-@pytest.mark.parametrize("dialect", Dialect)
-def test_end_is_the_last_word_whatever_waits(dialect: Dialect, ended_by_hq: bool) -> None:
+@pytest.mark.parametrize("dialect", AlfDialect)
+def test_end_is_the_last_word_whatever_waits(dialect: AlfDialect, ended_by_hq: bool) -> None:
     scene = Scene(dialect)
     scene.tell(SCANNER, SCAN, Motion())
     if ended_by_hq:
@@ -359,7 +359,7 @@ def test_what_waits_is_the_newest_and_encoded_once_however_many_clients_there_ar
         encoded.append(message.spec.name)
         return write_text(message)
 
-    monkeypatch.setattr(module, "write_text", counting)
+    monkeypatch.setattr(messages, "write_text", counting)
     scene = Scene(clients=250)
     scene.tell(SCANNER)
     for number in range(10):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from gateways.alf.messages import (
+    AlfDialect,
     AlfMessage,
-    Dialect,
     DriveCommand,
     DriveInfo,
     Measurement,
@@ -20,7 +20,7 @@ from gateways.alf.messages import (
     write_binary,
     write_text,
 )
-from gateways.alf.session import AlfSession, HqRole, VehicleRole
+from gateways.alf.session import AlfHqRole, AlfSession, VehicleRole
 from tests.conformance.side import plain
 from tests.gateways.alf.golden import ALL, BINARY, DRIVE, GOLDEN, INFO, INIT, OF_VEHICLE, TEXT, heard, session
 from zbridge.errors import EncodeError, ProtocolError
@@ -80,7 +80,7 @@ def test_a_text_with_a_field_missing_or_empty_or_no_number_or_one_of_400_digits_
         huge = ([GOOGOL4], [b"-" + GOOGOL4], [GOOGOL4 + b".000000"])
         for instead in (*huge, *(([], [b""], [b"x"], [b"nan"], [b"-"], [b"inf"]) if place else ())):
             broken = b"|".join(fields[:place] + instead + fields[place + 1 :]) + b";"
-            assert heard(session(HqRole, TEXT), broken) + heard(session(VehicleRole, TEXT), broken) == []
+            assert heard(session(AlfHqRole, TEXT), broken) + heard(session(VehicleRole, TEXT), broken) == []
 
 
 @pytest.mark.parametrize(
@@ -121,14 +121,14 @@ def test_what_a_dialect_cannot_carry_is_an_encode_error(write, message: AlfMessa
 # Framing
 
 
-@pytest.mark.parametrize("dialect", Dialect)
-def test_a_full_scan_of_the_largest_numbers_comes_whole(dialect: Dialect) -> None:
+@pytest.mark.parametrize("dialect", AlfDialect)
+def test_a_full_scan_of_the_largest_numbers_comes_whole(dialect: AlfDialect) -> None:
     if dialect is TEXT:
         frame = b"1|2147483647|2147483647|" + b"2147483647|" * 769 + b"44|725;"
     else:
         frame = bytes.fromhex("01 ffffff7f ffffff7f" + "ffffff7f00000000" * 769 + "2c000000 d5020000")
     scan = plain(Measurement(2**31 - 1, 2**31 - 1, np.full(769, 2**31 - 1), 44, 725))
-    assert heard(session(HqRole, dialect, points=769), frame * 2) == [scan] * 2
+    assert heard(session(AlfHqRole, dialect, points=769), frame * 2) == [scan] * 2
 
 
 def test_a_text_that_never_ends_is_counted_and_takes_bounded_memory() -> None:
@@ -161,15 +161,15 @@ def test_after_a_text_that_is_too_long_the_next_one_is_read_and_nothing_of_the_l
 @pytest.mark.parametrize(
     ("kind", "garbage"),
     [
-        (HqRole, bytes(5_000)),
-        (HqRole, DRIVE[BINARY][:4] + b"\x00"),
-        (HqRole, bytes(range(5, 255))),
-        (HqRole, b"]^-[\\"),
+        (AlfHqRole, bytes(5_000)),
+        (AlfHqRole, DRIVE[BINARY][:4] + b"\x00"),
+        (AlfHqRole, bytes(range(5, 255))),
+        (AlfHqRole, b"]^-[\\"),
         (VehicleRole, bytes.fromhex("00 01 02 04 05 fe")),
     ],
 )
 def test_bytes_that_begin_no_binary_message_are_counted_and_skipped(kind: type[AlfSession], garbage: bytes) -> None:
-    golden = INFO[BINARY] if kind is HqRole else DRIVE[BINARY]
+    golden = INFO[BINARY] if kind is AlfHqRole else DRIVE[BINARY]
     byte_by_byte = [garbage[at : at + 1] for at in range(len(garbage))]
     for reads in ([garbage + golden], [golden + garbage, golden], [*byte_by_byte, golden]):
         by = session(kind, BINARY)

@@ -4,17 +4,17 @@ from typing import Any
 
 import pytest
 
-from gateways.alf.messages import Dialect, DriveCommand
-from gateways.alf.session import AlfSession, HqRole, VehicleRole
+from gateways.alf.messages import AlfDialect, DriveCommand
+from gateways.alf.session import AlfHqRole, AlfSession, VehicleRole
 from tests.gateways.alf.golden import BINARY, DRIVE, DRIVES, END, INFO, MOVES, NEUTRAL, STANDS, TEXT, session
 from tests.gateways.rig import drained
 from zbridge.errors import Refused
 from zbridge.protocol.session import Role, State
 
 
-def hq(dialect: Dialect = TEXT, **options: Any) -> Any:
+def hq(dialect: AlfDialect = TEXT, **options: Any) -> Any:
     """The session of a link that drives."""
-    return session(HqRole, dialect, drives=STANDS[dialect], **options)
+    return session(AlfHqRole, dialect, drives=STANDS[dialect], **options)
 
 
 def until(session: Any, end: float, *driven: tuple[float, DriveCommand]) -> list[tuple[float, bytes]]:
@@ -32,8 +32,8 @@ def until(session: Any, end: float, *driven: tuple[float, DriveCommand]) -> list
     return sent
 
 
-@pytest.mark.parametrize("dialect", Dialect)
-@pytest.mark.parametrize(("kind", "role"), [(HqRole, Role.HQ), (VehicleRole, Role.ROBOT)])
+@pytest.mark.parametrize("dialect", AlfDialect)
+@pytest.mark.parametrize(("kind", "role"), [(AlfHqRole, Role.HQ), (VehicleRole, Role.ROBOT)])
 def test_who_is_connected_is_established_and_no_handshake_is_ever_overdue(kind, role, dialect) -> None:
     made = session(kind, dialect)
     made.expire(3600.0)
@@ -53,7 +53,7 @@ def test_who_is_connected_is_established_and_no_handshake_is_ever_overdue(kind, 
     ],
     ids=["none", "one", "two"],
 )
-@pytest.mark.parametrize("dialect", Dialect)
+@pytest.mark.parametrize("dialect", AlfDialect)
 def test_a_drive_link_says_speed_0_at_once_a_new_command_at_once_and_the_last_every_20_ms(
     dialect, driven, sent_ms
 ) -> None:
@@ -74,13 +74,13 @@ def test_two_messages_keep_the_gap_that_is_configured() -> None:
 
 SIDES = [
     pytest.param(hq, [], id="drive link"),
-    pytest.param(lambda dialect: session(HqRole, dialect), [], id="laser link"),
+    pytest.param(lambda dialect: session(AlfHqRole, dialect), [], id="laser link"),
     pytest.param(lambda dialect: session(VehicleRole, dialect), [INFO], id="vehicle"),
 ]
 
 
 @pytest.mark.parametrize("by_peer", [False, True])
-@pytest.mark.parametrize("dialect", Dialect)
+@pytest.mark.parametrize("dialect", AlfDialect)
 @pytest.mark.parametrize(("side", "said"), SIDES)
 def test_whoever_says_end_first_each_side_says_it_once_and_nothing_follows(side, said, dialect, by_peer: bool) -> None:
     made = side(dialect)
@@ -103,8 +103,8 @@ def test_whoever_says_end_first_each_side_says_it_once_and_nothing_follows(side,
     assert made.traffic.malformed == 0
 
 
-@pytest.mark.parametrize("dialect", Dialect)
-def test_what_came_before_end_is_delivered_and_nothing_behind_it_and_it_may_come_in_pieces(dialect: Dialect) -> None:
+@pytest.mark.parametrize("dialect", AlfDialect)
+def test_what_came_before_end_is_delivered_and_nothing_behind_it_and_it_may_come_in_pieces(dialect: AlfDialect) -> None:
     link = hq(dialect)
     assert link.receive(INFO[dialect] * 2 + END[dialect][:1], 0.1) == [MOVES[dialect]] * 2
     assert link.state is State.ESTABLISHED
@@ -134,7 +134,7 @@ def test_no_command_goes_behind_end_neither_the_newest_nor_one_that_comes_while_
 
 
 def test_a_session_that_was_closed_before_its_link_was_up_says_nothing() -> None:
-    link = HqRole(TEXT, drives=STANDS[TEXT])
+    link = AlfHqRole(TEXT, drives=STANDS[TEXT])
     link.close("gateway stopped", 0.0)
     link.open(0.0)
     assert drained(link, 0.0) == []

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from gateways.alf import PROTOCOL
-from gateways.alf.conformance.fragile_hq import FragileHq
-from gateways.alf.messages import Dialect, DriveCommand, DriveInfo, ScannerInit
+from gateways.alf.conformance.fragile_hq import FragileAlfHq
+from gateways.alf.messages import AlfDialect, DriveCommand, DriveInfo, ScannerInit
 from gateways.alf.simulator import SCANNER, SPEED_M_S, TEMPERATURE, Car
 from tests.conformance.scene import until
 from tests.gateways.alf.golden import BINARY, TEXT
@@ -21,13 +21,13 @@ CYCLE_S = 0.02
 """An HQ program repeats its command every 20 ms."""
 
 
-def car(x: float = 0.0, y: float = 0.0, heading: float = 0.0, dialect: Dialect = TEXT, seed: int = 1) -> Car:
+def car(x: float = 0.0, y: float = 0.0, heading: float = 0.0, dialect: AlfDialect = TEXT, seed: int = 1) -> Car:
     made = Car(seed, dialect)
     made.body.x, made.body.y, made.body.heading = x, y, heading
     return made
 
 
-def command(speed: int, right_deg: int = 0, *, backward: bool = False, dialect: Dialect = TEXT) -> DriveCommand:
+def command(speed: int, right_deg: int = 0, *, backward: bool = False, dialect: AlfDialect = TEXT) -> DriveCommand:
     straight = 0 if dialect is TEXT else 90
     return DriveCommand(speed, int(backward), straight + right_deg, False)
 
@@ -49,7 +49,7 @@ def seen_m(by: Car, angle_deg: float) -> float:
 
 
 def test_the_same_seed_and_commands_give_the_same_world_in_both_dialects_and_another_seed_another() -> None:
-    def story(seed: int, dialect: Dialect) -> list[object]:
+    def story(seed: int, dialect: AlfDialect) -> list[object]:
         told = Car(seed, dialect)
         live(told, 1.0, command(60, -45, dialect=dialect))
         live(told, 1.0, command(40, 30, backward=True, dialect=dialect))
@@ -62,8 +62,10 @@ def test_the_same_seed_and_commands_give_the_same_world_in_both_dialects_and_ano
 # How it moves
 
 
-@pytest.mark.parametrize("dialect", Dialect)
-def test_it_goes_straight_ahead_and_straight_back_stops_and_says_its_speed_without_the_sign(dialect: Dialect) -> None:
+@pytest.mark.parametrize("dialect", AlfDialect)
+def test_it_goes_straight_ahead_and_straight_back_stops_and_shows_speed_unsigned(
+    dialect: AlfDialect,
+) -> None:
     moved = car(dialect=dialect)
     before = seen_m(moved, 0)
     live(moved, 1.5, command(50, dialect=dialect))
@@ -93,8 +95,8 @@ def test_it_turns_to_where_the_wheels_point_the_more_the_farther_they_do_and_bac
     assert binary == pytest.approx([turns[-1], 0.0, turns[0], turns[0]])
 
 
-@pytest.mark.parametrize("dialect", Dialect)
-def test_speed_is_percent_and_above_100_without_clamping_in_text_and_100_in_binary(dialect: Dialect) -> None:
+@pytest.mark.parametrize("dialect", AlfDialect)
+def test_speed_is_percent_and_above_100_without_clamping_in_text_and_100_in_binary(dialect: AlfDialect) -> None:
     speeds = []
     for percent in (25, 100, 101, 255):
         moved = car(-4.0, dialect=dialect)
@@ -196,12 +198,12 @@ def test_info_says_how_fast_it_turns_and_what_pulls_it_to_the_side(right_deg: in
         assert told.lateral == pytest.approx(to_the_right, rel=0.02)
 
 
-@pytest.mark.parametrize("dialect", Dialect)
-async def test_the_judges_find_no_fault_with_its_two_links(dialect: Dialect) -> None:
+@pytest.mark.parametrize("dialect", AlfDialect)
+async def test_the_judges_find_no_fault_with_its_two_links(dialect: AlfDialect) -> None:
     ready: asyncio.Future[tuple[Address, ...]] = asyncio.get_running_loop().create_future()
     simulation = Simulation((Address("127.0.0.1", 0),) * 2, dialect=dialect.value, ready=ready.set_result)
-    driver = FragileHq(dialect=dialect.value, serves="drive")
-    viewer = FragileHq(dialect=dialect.value, serves="laser", repeat_s=None)
+    driver = FragileAlfHq(dialect=dialect.value, serves="drive")
+    viewer = FragileAlfHq(dialect=dialect.value, serves="laser", repeat_s=None)
     driver.drive(50, 0, 45)  # half right in text, half left in binary
     async with asyncio.timeout(20.0), asyncio.TaskGroup() as tasks:
         vehicle = tasks.create_task(PROTOCOL.simulate(simulation))

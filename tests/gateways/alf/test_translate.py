@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from gateways.alf import PROTOCOL
-from gateways.alf.messages import Dialect, Measurement, ScannerInit
-from gateways.alf.session import HqRole
-from gateways.alf.translate import AlfRobot, Options, points_of, ranges_m
+from gateways.alf.messages import AlfDialect, Measurement, ScannerInit
+from gateways.alf.session import AlfHqRole
+from gateways.alf.translate import AlfOptions, AlfRobot, points_of, ranges_m
 from tests.gateways.alf.golden import BINARY, INFO, INIT, NEUTRAL, TEXT
 from tests.gateways.rig import planned
 from zbridge.errors import ConfigError, ProtocolError, Refused
@@ -27,10 +27,10 @@ class Wire:
 
     def __init__(self, links: int = 1, **options: Any) -> None:
         self.metrics = Metrics()
-        self.robot = AlfRobot(Options(**{"points": 3, **options}), links, self.metrics)
+        self.robot = AlfRobot(AlfOptions(**{"points": 3, **options}), links, self.metrics)
         self.now = 0.0
         self.arrived_ns = STAMP
-        self.sessions: list[HqRole] = []
+        self.sessions: list[AlfHqRole] = []
         for link in range(links):
             self.connect(link)
 
@@ -206,7 +206,7 @@ def test_a_measurement_has_the_points_that_are_configured() -> None:
     ],
 )
 def test_the_points_that_the_scanner_tells_count_from_the_first_measurement_on_however_the_stream_is_cut(
-    dialect: Dialect, measurement: bytes
+    dialect: AlfDialect, measurement: bytes
 ) -> None:
     """Binary framing depends on it: a measurement in the same read as its scanner init must not be cut wrong."""
     stream = INIT[dialect] + measurement * 3
@@ -243,7 +243,7 @@ def test_an_absurd_scanner_is_counted_shows_no_scans_and_the_points_stay_as_they
 )
 def test_a_motion_is_in_si_units_y_to_the_left_z_up(options: dict[str, Any], acceleration, gyro) -> None:
     """In g and degrees per second, in thousandths and tenths of them in binary, unless told otherwise."""
-    motion = Wire(**options).one(INFO[Dialect(options.get("dialect", "text"))])
+    motion = Wire(**options).one(INFO[AlfDialect(options.get("dialect", "text"))])
     assert motion.speed == pytest.approx(0.1)
     assert motion.acceleration == pytest.approx(acceleration)
     assert motion.gyro == pytest.approx(gyro)
@@ -293,8 +293,8 @@ def test_speed_is_negative_when_the_last_direction_sent_was_backward_also_while_
         "forward 0.6 left 0.5 = 60 0 0 0 / left 0.5 turn 1 = 0 0 -90 0",
     ],
 )
-@pytest.mark.parametrize("dialect", Dialect)
-def test_a_command_leaves_at_once_and_is_repeated(dialect: Dialect, talk: str) -> None:
+@pytest.mark.parametrize("dialect", AlfDialect)
+def test_a_command_leaves_at_once_and_is_repeated(dialect: AlfDialect, talk: str) -> None:
     """Behind each command: speed, direction, degrees to the right (from full left in binary), light."""
     wire = Wire(dialect=dialect.value)
     assert wire.sent() == NEUTRAL[dialect]
@@ -310,8 +310,8 @@ def test_a_command_leaves_at_once_and_is_repeated(dialect: Dialect, talk: str) -
 @pytest.mark.parametrize(
     "talk", ["forward 0.8 turn 1 = 0 0 0 0", "forward -0.8 light on = 0 1 0 1", "switch on = 0 0 0 1"]
 )
-@pytest.mark.parametrize("dialect", Dialect)
-def test_the_frames_of_a_stop_are_told_and_change_nothing(dialect: Dialect, talk: str) -> None:
+@pytest.mark.parametrize("dialect", AlfDialect)
+def test_the_frames_of_a_stop_are_told_and_change_nothing(dialect: AlfDialect, talk: str) -> None:
     wire = Wire(dialect=dialect.value)
     command, _, expected = talk.partition(" = ")
     frame = wire.command(command)
@@ -344,7 +344,7 @@ def test_only_the_drive_link_gets_commands_and_both_give_telemetry() -> None:
 
 
 def test_before_its_drive_link_ever_was_up_a_robot_takes_no_command() -> None:
-    robot = AlfRobot(Options(), 2)
+    robot = AlfRobot(AlfOptions(), 2)
     robot.session("laser", "tcp://robot.test:2").open(0.0)
     assert (robot.ready, robot.driving) == (False, None)
     with pytest.raises(Refused, match="offline"):
@@ -380,10 +380,10 @@ def test_sideways_beside_other_motion_is_said_to_be_left_out() -> None:
 
 
 def test_the_defaults_are_those_of_the_page_and_every_option_can_be_set_and_is_in_the_template() -> None:
-    assert planned("alf").options == Options("text", 769, False, 100, None, None, 0.0)
-    options = Options("binary", 10_000, True, 255, 0.01, 0.001, 0.02)
+    assert planned("alf").options == AlfOptions("text", 769, False, 100, None, None, 0.0)
+    options = AlfOptions("binary", 10_000, True, 255, 0.01, 0.001, 0.02)
     assert planned("alf", 2, **{name: getattr(options, name) for name in options.__struct_fields__}).options == options
-    for name in Options.__struct_fields__:
+    for name in AlfOptions.__struct_fields__:
         assert f"\n{name} = " in PROTOCOL.template or f"\n# {name} = " in PROTOCOL.template
     with pytest.raises(ConfigError, match="at most 2 links"):
         planned("alf", 3)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from typing import Any
 
-from gateways.ros2.settings import Options
+from gateways.ros2.options import RosOptions
 from gateways.ros2.translate import RosRobot
 from tests.gateways.rig import drained
 from zbridge.metrics import Metrics
@@ -46,7 +46,7 @@ class RosScene:
 
     def __init__(self, **options: Any) -> None:
         self.metrics = Metrics()
-        self.robot = RosRobot(Options(**options), 1, self.metrics)
+        self.robot = RosRobot(RosOptions(**options), 1, self.metrics)
         self.session = self.robot.session("router", "tcp://h:1")
         self.now = 100.0
         self.written: list[KeyedSample] = []
@@ -60,9 +60,9 @@ class RosScene:
 
     def feed(self, sample: KeyedSample) -> list[Any]:
         """Let the link bring something; give what the session hands on."""
-        heard = self.session.receive(write_sample(sample), self.now)
+        received = self.session.receive(write_sample(sample), self.now)
         self.write()
-        return heard
+        return received
 
     def write(self) -> list[KeyedSample]:
         """Take what the session writes now."""
@@ -93,8 +93,8 @@ class RosScene:
 
     def hears(self, topic: str, by: str, **fields: Any) -> dict[str, Any]:
         """Let a publisher put a message; give the telemetry it makes, by path."""
-        heard = self.says(topic, by, TYPES.encode(TYPES.message(KINDS[topic], **fields)))
-        return {path.path: message for one in heard for path, message in self.robot.telemetry(one, self.time_ns)}
+        received = self.says(topic, by, TYPES.encode(TYPES.message(KINDS[topic], **fields)))
+        return {path.path: message for one in received for path, message in self.robot.telemetry(one, self.time_ns)}
 
     def establish(self, kind: str = TWIST) -> str:
         """Bring up a robot with odometry and a base; give the publisher's token."""

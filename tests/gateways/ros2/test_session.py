@@ -7,7 +7,7 @@ import struct
 
 import pytest
 
-from gateways.ros2.twists import Velocity
+from gateways.ros2.messages import Velocity
 from tests.gateways.ros2.scene import KINDS, STAMPED, TWIST, TYPES, RosScene, header, key, token
 from zbridge.errors import NotReady
 from zbridge.protocol import KeyedSample, SampleKind
@@ -290,7 +290,7 @@ def test_our_own_endpoints_are_no_others() -> None:
     for made in own:
         scene.feed(KeyedSample(SampleKind.APPEARED, made, stamp_ns=scene.time_ns))
     assert (scene.session.doubts, scene.session.traffic.malformed) == ((), 0)
-    assert len(scene.session.graph.publishers) == len(scene.session.graph.takers) == 1
+    assert len(scene.session.graph.publishers) == len(scene.session.graph.subscribers) == 1
 
 
 OWN = {"map": ("MS", ":1:,1:,:,:,,"), "scan": ("MS", "2::,5:,:,:,,"), "cmd_vel": ("MP", "::,10:,:,:,,")}

@@ -5,7 +5,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from gateways.ros2.settings import Options
+from gateways.ros2.options import RosOptions
 from tests.gateways.rig import planned
 from zbridge.app import config
 from zbridge.errors import ConfigError
@@ -13,9 +13,9 @@ from zbridge.protocol.address import ZenohAddress
 
 
 def test_topics_stand_in_the_namespace_unless_they_are_absolute() -> None:
-    options = Options(namespace="/robots/r1", odom="/odom", map="")
+    options = RosOptions(namespace="/robots/r1", odom="/odom", map="")
     assert (options.topic("scan"), options.topic("odom"), options.topic("map")) == ("/robots/r1/scan", "/odom", None)
-    assert Options().topic("image") == "/image/compressed"
+    assert RosOptions().topic("image") == "/image/compressed"
 
 
 WRONG: dict[str, tuple[dict[str, Any], str]] = {
@@ -54,4 +54,4 @@ def test_defaults_are_what_the_template_says() -> None:
 
     lines = [line.removeprefix("# ") for line in ros2.TEMPLATE.splitlines()]
     written = tomllib.loads("\n".join(lines))["device"]["options"]
-    assert msgspec.convert({**written, "namespace": ""}, Options) == Options()
+    assert msgspec.convert({**written, "namespace": ""}, RosOptions) == RosOptions()

@@ -21,8 +21,8 @@ from gateways.ros2.simulator import (
     FULL_V,
     RANGE_M,
     TIMEOUT_S,
-    Machine,
     NodeRole,
+    RosMachine,
     simulate,
 )
 from tests.gateways.rig import drained
@@ -36,8 +36,8 @@ make = TYPES.message
 HEADER = make("std_msgs/msg/Header", frame_id="laser")
 
 
-def machine(x: float = 0.0, y: float = 0.0, heading: float = 0.0) -> Machine:
-    made = Machine(1, TYPES)
+def machine(x: float = 0.0, y: float = 0.0, heading: float = 0.0) -> RosMachine:
+    made = RosMachine(1, TYPES)
     made.body.x, made.body.y, made.body.heading = x, y, heading
     return made
 
@@ -47,7 +47,7 @@ def twist(forward: float, turn: float = 0.0) -> Any:
     return make(TWIST, linear=linear, angular=angular)
 
 
-def live(moved: Machine, seconds: float, command: Any = None) -> None:
+def live(moved: RosMachine, seconds: float, command: Any = None) -> None:
     """Let it live in steps of 20 ms; a command is repeated at each."""
     for _ in range(round(seconds / 0.02)):
         if command is not None:
@@ -92,7 +92,7 @@ def test_it_is_never_faster_than_it_can_be_and_obeys_numbers_only(command: Any, 
 
 
 def test_a_seed_is_a_place_and_another_seed_another() -> None:
-    assert repr(Machine(3, TYPES)) == repr(Machine(3, TYPES)) != repr(Machine(4, TYPES))
+    assert repr(RosMachine(3, TYPES)) == repr(RosMachine(3, TYPES)) != repr(RosMachine(4, TYPES))
 
 
 # What it measures; the walls of the room are 5 m from its middle

@@ -32,7 +32,7 @@ def scene() -> RosScene:
     return scene
 
 
-def heard(scene: RosScene, topic: str, **fields: Any) -> dict[str, Any]:
+def received(scene: RosScene, topic: str, **fields: Any) -> dict[str, Any]:
     by = scene.appears(topic)
     return scene.hears(topic, by, header=fields.pop("header", header(scene.time_ns)), **fields)
 
@@ -42,17 +42,17 @@ def ranges(scan: Any) -> list[float | None]:
 
 
 def test_a_scan_keeps_its_geometry_and_what_is_out_of_range_is_no_measurement(scene: RosScene) -> None:
-    told = heard(scene, "scan", **SCAN)
+    told = received(scene, "scan", **SCAN)
     assert ranges(told["scan"]) == [1.0, None, None, None, 8.0]
     scan, scanner = told["scan"], told["scanner"]
     assert (scan.angle_min, scan.angle_increment, scan.range_max) == (-1.0, 0.5, 8.0)
     assert isinstance(scanner, Scanner)
     assert (scanner.angle_max, scanner.points) == (1.0, 5)
-    assert "scanner" not in heard(scene, "scan", **SCAN), "told once"
+    assert "scanner" not in received(scene, "scan", **SCAN), "told once"
 
 
 def test_a_scan_of_a_lidar_that_turns_clockwise_is_turned_round(scene: RosScene) -> None:
-    told = heard(scene, "scan", **{**SCAN, "angle_min": 1.0, "angle_increment": -0.5})
+    told = received(scene, "scan", **{**SCAN, "angle_min": 1.0, "angle_increment": -0.5})
     assert ranges(told["scan"]) == [8.0, None, None, None, 1.0]
     assert (told["scan"].angle_min, told["scan"].angle_increment) == (-1.0, 0.5)
 
@@ -60,7 +60,7 @@ def test_a_scan_of_a_lidar_that_turns_clockwise_is_turned_round(scene: RosScene)
 def test_a_lidar_that_looks_to_the_left_is_told_in_the_options() -> None:
     scene = RosScene(scan_yaw_deg=90.0)
     scene.establish()
-    assert heard(scene, "scan", **SCAN)["scan"].angle_min == pytest.approx(math.pi / 2 - 1.0)
+    assert received(scene, "scan", **SCAN)["scan"].angle_min == pytest.approx(math.pi / 2 - 1.0)
 
 
 def odometry(x: float, speed: float, turn: float) -> dict[str, Any]:
@@ -81,7 +81,7 @@ def odometry(x: float, speed: float, turn: float) -> dict[str, Any]:
 
 
 def test_odometry_is_pose_and_motion_and_speed_is_a_fraction_of_full_scale(scene: RosScene) -> None:
-    told = heard(scene, "odom", **odometry(1.5, -1.0, 0.3))
+    told = received(scene, "odom", **odometry(1.5, -1.0, 0.3))
     assert told["pose"] == Pose(
         1.5, -2.0, told["pose"].heading, stamp_ns=scene.time_ns, device_ms=scene.time_ns // 10**6
     )
@@ -89,20 +89,20 @@ def test_odometry_is_pose_and_motion_and_speed_is_a_fraction_of_full_scale(scene
     motion = told["motion"]
     assert isinstance(motion, Motion)
     assert (motion.speed, motion.gyro) == (-0.5, (0.0, 0.0, 0.3))
-    assert heard(scene, "odom", **odometry(0.0, 9.0, 0.0))["motion"].speed == 1.0
+    assert received(scene, "odom", **odometry(0.0, 9.0, 0.0))["motion"].speed == 1.0
     assert scene.robot.known(topics.POSE) is not None
 
 
 def test_an_imu_gives_motion_with_the_speed_of_the_odometry_and_no_measurement_is_none(scene: RosScene) -> None:
-    heard(scene, "odom", **odometry(0.0, 1.0, 0.3))
-    told = heard(
+    received(scene, "odom", **odometry(0.0, 1.0, 0.3))
+    told = received(
         scene,
         "imu",
         linear_acceleration=make("geometry_msgs/msg/Vector3", x=0.5, z=9.8),
         angular_velocity_covariance=np.array([-1.0] + [0.0] * 8),
     )
     assert (told["motion"].speed, told["motion"].acceleration, told["motion"].gyro) == (0.5, (0.5, 0.0, 9.8), None)
-    assert "motion" not in heard(scene, "odom", **odometry(0.0, 1.0, 0.3)), "the imu knows better"
+    assert "motion" not in received(scene, "odom", **odometry(0.0, 1.0, 0.3)), "the imu knows better"
 
 
 def grid(data: list[int], width: int = 3, height: int = 2, **origin: float) -> dict[str, Any]:
@@ -116,17 +116,17 @@ def grid(data: list[int], width: int = 3, height: int = 2, **origin: float) -> d
 
 
 def test_a_map_has_unknown_free_and_occupied_cells_row_by_row(scene: RosScene) -> None:
-    told = heard(scene, "map", **grid([-1, 0, 25, 26, 65, 100]))["map"]
+    told = received(scene, "map", **grid([-1, 0, 25, 26, 65, 100]))["map"]
     assert told.cells.tolist() == [[0, 1, 1], [0, 2, 2]]
     assert (told.rows, told.columns, told.cell, told.origin) == (2, 3, 0.5, (-1.0, -2.0))
     assert scene.robot.known(topics.MAP) is told
 
 
 def test_a_battery_and_a_picture(scene: RosScene) -> None:
-    told = heard(scene, "battery_state", percentage=0.5, voltage=12.0, current=math.nan, power_supply_status=2)
+    told = received(scene, "battery_state", percentage=0.5, voltage=12.0, current=math.nan, power_supply_status=2)
     assert (told["battery"].level, told["battery"].voltage) == (0.5, 12.0)
     assert (told["battery"].current, told["battery"].charging) == (None, False)
-    told = heard(
+    told = received(
         scene, "image/compressed", format="rgb8; jpeg compressed bgr8", data=np.frombuffer(b"\xff\xd8x", np.uint8)
     )
     assert isinstance(told["image"], Image)
@@ -154,7 +154,7 @@ ABSURD: dict[str, tuple[str, dict[str, Any]]] = {
 def test_absurd_messages_are_no_telemetry(scene: RosScene, case: str) -> None:
     topic, fields = ABSURD[case]
     with pytest.raises(ProtocolError):
-        heard(scene, topic, **fields)
+        received(scene, topic, **fields)
 
 
 # Clocks
@@ -171,7 +171,7 @@ STAMPS = {
 @pytest.mark.parametrize("case", STAMPS)
 def test_a_stamp_is_believed_if_it_fits_its_arrival_else_counted(scene: RosScene, case: str) -> None:
     measured, believed, counts = STAMPS[case]
-    told = heard(scene, "scan", header=header(scene.time_ns + measured), **SCAN)
+    told = received(scene, "scan", header=header(scene.time_ns + measured), **SCAN)
     assert told["scan"].stamp_ns == scene.time_ns + believed
     assert told["scan"].device_ms == (scene.time_ns + measured) // 10**6
     assert [name for name in ("stamps_ahead", "stamps_astray") if scene.metrics.total(name)] == list(counts)
@@ -179,7 +179,7 @@ def test_a_stamp_is_believed_if_it_fits_its_arrival_else_counted(scene: RosScene
 
 def test_a_simulated_clock_that_begins_anew_breaks_nothing(scene: RosScene) -> None:
     for stamp_ns in (10_000_000_000, 10_100_000_000, 0, 100_000_000):
-        told = heard(scene, "scan", header=header(stamp_ns), **SCAN)
+        told = received(scene, "scan", header=header(stamp_ns), **SCAN)
         assert told["scan"].stamp_ns == scene.time_ns
         assert told["scan"].device_ms == stamp_ns // 10**6
 
@@ -250,24 +250,24 @@ def test_a_robot_that_is_away_takes_nothing() -> None:
 
 
 def test_a_new_session_remembers_nothing_of_the_one_before(scene: RosScene) -> None:
-    heard(scene, "odom", **odometry(0.0, 1.0, 0.3))
-    heard(scene, "imu")
-    heard(scene, "scan", **SCAN)
+    received(scene, "odom", **odometry(0.0, 1.0, 0.3))
+    received(scene, "imu")
+    received(scene, "scan", **SCAN)
     assert scene.robot.known(topics.POSE) is not None
     scene.session = scene.robot.session("router", "tcp://h:1")
     scene.session.open(scene.now)
     scene.feed(KeyedSample(SampleKind.OPENED, payload=b"cafe", stamp_ns=scene.time_ns))
     assert scene.robot.known(topics.POSE) is None
     assert scene.robot.driving is scene.session
-    assert "scanner" in heard(scene, "scan", **SCAN)
-    assert heard(scene, "imu")["motion"].speed is None
+    assert "scanner" in received(scene, "scan", **SCAN)
+    assert received(scene, "imu")["motion"].speed is None
 
 
 @pytest.mark.parametrize(("status", "charging"), [(0, None), (1, True), (2, False), (3, False), (4, False)])
 def test_whether_a_battery_is_charged_is_told_where_the_robot_knows(
     scene: RosScene, status: int, charging: bool | None
 ) -> None:
-    assert heard(scene, "battery_state", percentage=1.0, power_supply_status=status)["battery"].charging is charging
+    assert received(scene, "battery_state", percentage=1.0, power_supply_status=status)["battery"].charging is charging
 
 
 def test_a_drive_says_nothing_of_what_was_left_out_where_nothing_was(scene: RosScene) -> None:

@@ -10,8 +10,10 @@ from typing import NamedTuple
 import msgspec
 
 from gateways.tcpudp.messages import Packet
-from gateways.tcpudp.session import HqRole, RobotRole
-from gateways.tcpudp.translate import Options, TcpUdpRobot
+from gateways.tcpudp.options import TcpUdpOptions
+from gateways.tcpudp.session.hq_role import HqRole
+from gateways.tcpudp.session.robot_role import RobotRole
+from gateways.tcpudp.translate import TcpUdpRobot
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import Topic
 from zbridge.protocol.session import Datagram
@@ -149,8 +151,8 @@ class Timed:
 class Stage:
     """A robot seen from its HQ, with a session that was established a second ago, and what leaves it."""
 
-    def __init__(self, settings: bytes, options: Options | None = None) -> None:
-        self.robot = TcpUdpRobot(options or Options())
+    def __init__(self, settings: bytes, options: TcpUdpOptions | None = None) -> None:
+        self.robot = TcpUdpRobot(options or TcpUdpOptions())
         self.timed = self._connected(settings, 0.0)
 
     def connect(self, settings: bytes) -> None:

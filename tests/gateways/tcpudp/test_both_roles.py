@@ -10,7 +10,9 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from gateways.tcpudp.session import HqRole, RobotRole, limits
+from gateways.tcpudp.session import limits
+from gateways.tcpudp.session.hq_role import HqRole
+from gateways.tcpudp.session.robot_role import RobotRole
 from gateways.tcpudp.settings import RobotSettings13, Settings, Settings12
 from tests.gateways.tcpudp.frames import ANSWER_TRUE, Sent, Timed, framed, server_settings
 from zbridge.protocol.session import State

@@ -2,7 +2,9 @@
 
 import pytest
 
-from gateways.tcpudp.session import HqRole, RobotRole, limits
+from gateways.tcpudp.session import limits
+from gateways.tcpudp.session.hq_role import HqRole
+from gateways.tcpudp.session.robot_role import RobotRole
 from gateways.tcpudp.settings import RobotSettings13, Settings
 from tests.captures import payloads
 from tests.conformance.side import plain

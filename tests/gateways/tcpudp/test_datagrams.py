@@ -17,7 +17,7 @@ from unittest import mock
 import pytest
 
 from gateways.tcpudp import PROTOCOL
-from gateways.tcpudp.hq import HqOptions
+from gateways.tcpudp.options import TcpUdpHqOptions
 from gateways.tcpudp.session import robot_role as sessions
 from tests.clock import scene_of
 from tests.gateways.tcpudp.frames import ANSWER_TRUE, LISTED, START, bearing, client_settings, framed
@@ -69,7 +69,7 @@ class Scene:
         robot.open()
         plan = ListenerPlan(
             PROTOCOL,
-            HqOptions(client_port=self.client_port, **options),
+            TcpUdpHqOptions(client_port=self.client_port, **options),
             Address("127.0.0.1", 0),
             HqSettings(protocol="tcpudp", listen="tcp://127.0.0.1:0"),
             (),
@@ -212,7 +212,7 @@ class Program:
         """Shake hands, the 5 being lost; or it comes so many times, too late."""
         with mock.patch.object(sessions, "PROBE_S", SHORT_S):
             await self.greet()
-        await self.scene.until(lambda: self.session._handshake.step is sessions.Step.UNANSWERED)
+        await self.scene.until(lambda: self.session._handshake.step is sessions.RobotStep.UNANSWERED)
         for _ in range(late):
             self.send_udp(5)
         await self.scene.taken_in()

@@ -10,9 +10,11 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from gateways.tcpudp.hq import HqClient, HqOptions, TcpUdpHq, display
-from gateways.tcpudp.hq import client as client_module
+from gateways.tcpudp import messages
+from gateways.tcpudp.hq import TcpUdpHq
+from gateways.tcpudp.hq_client import TcpUdpClient
 from gateways.tcpudp.messages import Packet, encode_packet
+from gateways.tcpudp.options import TcpUdpHqOptions
 from tests.gateways.tcpudp import frames as f
 from zbridge.errors import EncodeError, ProtocolError
 from zbridge.fleet import payload as codec
@@ -60,13 +62,13 @@ def knowing(grid: Map | None = None, pose: Pose | None = None, view: RobotView |
 
 
 def side(view: RobotView | None = None, **options: Any) -> TcpUdpHq:
-    return TcpUdpHq(HqOptions(**options), view or RobotView())
+    return TcpUdpHq(TcpUdpHqOptions(**options), view or RobotView())
 
 
 class Client(f.Timed):
     """A client of a listener; every act gives the frames that left because of it within a second."""
 
-    session: HqClient
+    session: TcpUdpClient
 
     def __init__(self, listener: TcpUdpHq, number: int = 2) -> None:
         self.listener = listener
@@ -218,7 +220,7 @@ def test_clients_have_ids_of_their_own_a_deadman_and_no_right_to_drive_at_first_
     assert listener.deadman_s == 1.3
     assert listener.initial_commands() == ((topics.CMD_MODE, Mode("none")),)
     with pytest.raises(msgspec.ValidationError, match="slam_map_size is smaller than slam_map_interval"):
-        msgspec.convert({"slam_map_size": 5, "slam_map_interval": 10}, HqOptions)
+        msgspec.convert({"slam_map_size": 5, "slam_map_interval": 10}, TcpUdpHqOptions)
 
 
 # What clients are shown
@@ -470,8 +472,7 @@ def test_a_message_is_encoded_once_for_clients_of_all_versions(topic, message, e
         written.append(packet)
         return encode_packet(packet, sender_id)
 
-    monkeypatch.setattr(client_module, "encode_packet", write)
-    monkeypatch.setattr(display, "encode_packet", write)
+    monkeypatch.setattr(messages, "encode_packet", write)
     listener.show(topic, message)
     assert topic is not topics.MAP or not written, "a map is not made where there is no client"
     assert sum(len(client.shown(topic, message)) for client in crowd) == (8 if message is REQUEST else 12)

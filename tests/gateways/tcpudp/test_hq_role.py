@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from gateways.tcpudp import messages as m
-from gateways.tcpudp.session import HqRole, limits
+from gateways.tcpudp.options import TcpUdpOptions
+from gateways.tcpudp.session import limits
+from gateways.tcpudp.session.hq_role import HqRole
 from gateways.tcpudp.settings import Feature
-from gateways.tcpudp.translate import Options, TcpUdpRobot
+from gateways.tcpudp.translate import TcpUdpRobot
 from tests.gateways.tcpudp import frames as f
 from tests.gateways.tcpudp.golden import GOLDEN
 from zbridge.errors import EncodeError, Refused
@@ -106,7 +108,7 @@ def test_a_version_list_that_cannot_be_answered_does_no_harm() -> None:
     ],
 )
 def test_the_gateway_announces_what_it_is_told(announce, listed, block, answered) -> None:
-    timed = f.Timed(TcpUdpRobot(msgspec.convert({"announce": announce}, Options)).session("robot", ""))
+    timed = f.Timed(TcpUdpRobot(msgspec.convert({"announce": announce}, TcpUdpOptions)).session("robot", ""))
     timed.stream(f.server_settings(listed, block), 0.1)
     answer = f.LISTED if listed == f.LISTED_14 else listed
     assert timed.frames("tcp") == [f.framed(5, 3, f.counted(answer) + bytes.fromhex(answered))]

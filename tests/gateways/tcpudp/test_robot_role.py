@@ -5,7 +5,8 @@ import contextlib
 import pytest
 
 from gateways.tcpudp import messages as m
-from gateways.tcpudp.session import RobotRole, limits
+from gateways.tcpudp.session import limits
+from gateways.tcpudp.session.robot_role import RobotRole
 from gateways.tcpudp.settings import RobotSettings13, Settings, Settings12
 from tests.gateways.tcpudp import frames as f
 from tests.gateways.tcpudp.golden import GOLDEN

@@ -6,7 +6,8 @@ import asyncio
 
 import pytest
 
-from gateways.tcpudp.session import HqRole, limits
+from gateways.tcpudp.session import limits
+from gateways.tcpudp.session.hq_role import HqRole
 from tests.gateways.tcpudp import frames as f
 from tests.robot.test_device import Rig, serving
 from zbridge.fleet import topics

@@ -34,9 +34,9 @@ def drawn(told: Vehicle) -> np.ndarray:
 
 def story(seed: int) -> tuple[m.ServerPosition, bytes]:
     told = Vehicle(seed)
-    told.look()
+    told.sweep_lidar()
     live(told, 2.0, FORWARD)
-    told.look()
+    told.sweep_lidar()
     live(told, 1.0, m.ClientJoystickRotate(0.7))
     return told.position(), told.map().cells
 
@@ -126,7 +126,7 @@ def test_packets_are_answered(packet: m.Packet, answers: tuple[m.Packet, ...]) -
 
 def test_the_map_is_x_major_and_shows_the_walls() -> None:
     told = vehicle(x=3.5, y=0.0)
-    told.look()
+    told.sweep_lidar()
     assert drawn(told)[85, 50] == 1, "where it stands is free"
     assert 2 in drawn(told)[98:, 50], "the wall at x = 5 m"
     assert drawn(told)[10, 50] == 0, "out of its lidar's range"

@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-from gateways.tcpudp.translate import Options
+from gateways.tcpudp.options import TcpUdpOptions
 from tests.gateways.tcpudp.frames import LISTED, LISTED_14, START, Stage, server_settings
 from tests.robot.test_device import Program, Rig, established, serving
 from zbridge.errors import Refused
@@ -57,7 +57,7 @@ LETTERS = {
 
 def left(version: str, script: str, **options: object) -> str:
     """What leaves a robot, a letter for each packet; ``script``: acts, and seconds to wait ("+0.1") after them."""
-    stage, letters = Stage(SETTINGS[version], Options(**options)), ""  # type: ignore[arg-type]
+    stage, letters = Stage(SETTINGS[version], TcpUdpOptions(**options)), ""  # type: ignore[arg-type]
     names = {bytes.fromhex(frame): letter for letter, frame in LETTERS.items()}
     for word in script.split():
         if word.startswith("+"):
@@ -161,7 +161,7 @@ def test_both_sends_translation_and_turn_in_turns_although_every_command_replace
     ids=["13", "10", "both", "neither"],
 )
 def test_of_the_pair_only_what_the_robot_may_be_sent(force: tuple[str | int, ...], sent: list[bytes] | None) -> None:
-    stage = Stage(SETTINGS["1.3"], Options(force=force))  # type: ignore[arg-type]
+    stage = Stage(SETTINGS["1.3"], TcpUdpOptions(force=force))  # type: ignore[arg-type]
     stage.command(*ACTS["auto"])
     stage.after(0.1)
     stage.connect(NO_JOYSTICK)

@@ -9,7 +9,7 @@ import msgpack
 import numpy as np
 import pytest
 
-from gateways.tcpudp.translate import Options
+from gateways.tcpudp.options import TcpUdpOptions
 from tests.gateways.tcpudp.frames import LISTED, LISTED_14, Stage, counted, framed, server_settings
 from tests.robot.test_device import serving
 from zbridge.errors import ProtocolError
@@ -47,10 +47,10 @@ def a_map(cells: bytes) -> bytes:
 @pytest.mark.parametrize(
     ("options", "position", "x", "y", "heading"),
     [
-        (Options(), (150.0, -50.0, 0.0), 1.5, -0.5, math.pi / 2),
-        (Options(), (0.0, 0.0, 90.0), 0.0, 0.0, math.pi),
-        (Options(), (1.0, 2.0, -90.0), 0.01, 0.02, 0.0),
-        (Options(length_unit_m=0.001, heading_offset=0.0), (150.0, -50.0, 180.0), 0.15, -0.05, math.pi),
+        (TcpUdpOptions(), (150.0, -50.0, 0.0), 1.5, -0.5, math.pi / 2),
+        (TcpUdpOptions(), (0.0, 0.0, 90.0), 0.0, 0.0, math.pi),
+        (TcpUdpOptions(), (1.0, 2.0, -90.0), 0.01, 0.02, 0.0),
+        (TcpUdpOptions(length_unit_m=0.001, heading_offset=0.0), (150.0, -50.0, 180.0), 0.15, -0.05, math.pi),
     ],
 )
 def test_a_pose_is_in_metres_with_x_and_y_kept_and_its_heading_turned_by_a_quarter(options, position, x, y, heading):
@@ -67,7 +67,9 @@ def test_a_map_is_transposed_from_x_major_to_rows_of_y_and_unknown_values_are_un
     assert rows(grid) == [[0, 2, 1], [1, 2, 0], [2, 0, 1]]
     assert grid is not None
     assert (grid.cell, grid.stamp_ns, *grid.origin) == pytest.approx((0.1, 7, -0.15, -0.15))
-    grid = shown(Stage(settings(), Options(map_cell_m=0.25, map_origin=(-1.0, 2.0))), a_map(bytes([3, 1, 2, 255])))
+    grid = shown(
+        Stage(settings(), TcpUdpOptions(map_cell_m=0.25, map_origin=(-1.0, 2.0))), a_map(bytes([3, 1, 2, 255]))
+    )
     assert rows(grid) == [[0, 2], [1, 0]]
     assert grid is not None
     assert (grid.cell, grid.origin) == (0.25, (-1.0, 2.0))

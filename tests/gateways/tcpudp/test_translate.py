@@ -6,7 +6,8 @@ import struct
 import numpy as np
 import pytest
 
-from gateways.tcpudp.translate import Options, TcpUdpRobot, polar_ranges
+from gateways.tcpudp.options import TcpUdpOptions
+from gateways.tcpudp.translate import TcpUdpRobot, polar_ranges
 from tests.gateways.tcpudp.frames import LISTED, STOP, Stage, bearing, server_settings
 from zbridge.errors import EncodeError, Refused
 from zbridge.fleet import topics
@@ -18,7 +19,7 @@ FULL_TURN = Scan(0.0, math.radians(1), 0.1, 8.0, np.full(360, 2.0, np.float32))
 
 
 def stage(flags: str = "00010101010101", **options: object) -> Stage:
-    return Stage(server_settings(LISTED, flags + "0000000000000000", 2), Options(**options))  # type: ignore[arg-type]
+    return Stage(server_settings(LISTED, flags + "0000000000000000", 2), TcpUdpOptions(**options))  # type: ignore[arg-type]
 
 
 FULL_SCALE = {"speed_full": 3.0, "turn_full": 0.5}
@@ -121,7 +122,7 @@ def test_what_the_robot_cannot_do_is_refused(flags: str, topic: Topic, command: 
 
 
 def test_a_robot_is_ready_while_its_session_is_established_and_refuses_all_before_the_first_connection() -> None:
-    robot = TcpUdpRobot(Options())
+    robot = TcpUdpRobot(TcpUdpOptions())
     assert (robot.driving, robot.ready) == (None, False)
     with pytest.raises(Refused, match="offline"):
         robot.command(topics.CMD_DRIVE, Drive(), 0.0)

@@ -8,29 +8,29 @@ import numpy as np
 
 from gateways.wc2ec.messages import (
     ChangeSensor,
-    Dialect,
     DisableSensor,
     EnableSensor,
     Error,
     RegisterSensor,
-    Sender,
     SensorData,
     SetSensor,
     SetValue,
+    Wc2EcDialect,
+    Wc2EcSender,
     frame_end,
     read,
     write,
 )
 from tests.conformance.side import Side, framed
 
-DRAFT, DEPLOYED = Dialect.DRAFT, Dialect.DEPLOYED
-WC, EC = Sender.WC, Sender.EC
+DRAFT, DEPLOYED = Wc2EcDialect.DRAFT, Wc2EcDialect.DEPLOYED
+WC, EC = Wc2EcSender.WC, Wc2EcSender.EC
 VALUES = 3
 """Configuration values of a sensor: a setting."""
 LONG = bytes(range(1, 256))
 """A name of 255 bytes that is not UTF-8."""
 
-GOLDEN: dict[tuple[Dialect, Sender], list[tuple[Any, bytes]]] = {
+GOLDEN: dict[tuple[Wc2EcDialect, Wc2EcSender], list[tuple[Any, bytes]]] = {
     (DEPLOYED, WC): [
         (RegisterSensor(53, 0, b"wheel1"), bytes.fromhex("00 35 00 06 77 68 65 65 6c 31")),
         (RegisterSensor(255, 254, b""), bytes.fromhex("00 ff fe 00")),
@@ -60,7 +60,7 @@ GOLDEN: dict[tuple[Dialect, Sender], list[tuple[Any, bytes]]] = {
 }
 
 
-def _side(dialect: Dialect, sender: Sender) -> Side:
+def _side(dialect: Wc2EcDialect, sender: Wc2EcSender) -> Side:
     golden = GOLDEN[dialect, sender]
     end = frame_end(dialect, sender, values=VALUES)
 

@@ -3,7 +3,7 @@
 The values are read off the bytes by hand: twelve registrations, then twenty rounds of six readings, and one more.
 """
 
-from gateways.wc2ec.settings import Options
+from gateways.wc2ec.options import Wc2EcOptions
 from gateways.wc2ec.translate import Wc2EcRobot
 from tests.captures import payloads
 from zbridge.fleet.messages import Device, Devices, Reading
@@ -24,7 +24,7 @@ VALUES = {6: 1000.0, 7: 750.5, 8: 123.456, 9: 0.0, 10: -1.0, 11: 0.001}
 
 def test_the_recorded_devices_are_the_device_table_and_their_readings_on_the_keys_of_their_names() -> None:
     metrics, tables, readings = Metrics(), list[Devices](), list[tuple[str, Reading]]()
-    robot = Wc2EcRobot(Options(bounds_default=(0.0, 1000.0)), 1, metrics)
+    robot = Wc2EcRobot(Wc2EcOptions(bounds_default=(0.0, 1000.0)), 1, metrics)
     session = robot.session("robot", "tcp://robot.test:1")
     session.open(0.0)
     for record in payloads(NAME, source=PORT):

@@ -16,9 +16,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gateways.wc2ec import device_table
+from gateways.wc2ec import hq as display
 from gateways.wc2ec.conformance.parser import ControllerReader as Reader
-from gateways.wc2ec.hq import HqOptions, Wc2EcHq, Wheels, device_table, display
-from gateways.wc2ec.settings import DeviceOption, Options
+from gateways.wc2ec.hq import Wc2EcHq
+from gateways.wc2ec.options import DeviceOption, Wc2EcHqOptions, Wc2EcOptions, Wheels
 from gateways.wc2ec.translate import Wc2EcRobot
 from tests.captures import stream
 from tests.conformance.scene import table
@@ -90,7 +92,7 @@ class Scene(HqScene):
 
     def __init__(self, script: str = "", **options: Any) -> None:
         view = RobotView()
-        super().__init__(Wc2EcHq(HqOptions(**options), view), view)
+        super().__init__(Wc2EcHq(Wc2EcHqOptions(**options), view), view)
         self.there = False
         self.play(script)
 
@@ -438,7 +440,7 @@ def test_settings_of_sensors_are_passed_on_and_how_many_values_they_have_is_a_se
 
 def test_the_draft_must_have_its_devices_listed_each_once() -> None:
     with pytest.raises(ConfigError):
-        HqOptions(dialect="draft", devices=(DeviceOption("a", 0), DeviceOption("b", 0)))
+        Wc2EcHqOptions(dialect="draft", devices=(DeviceOption("a", 0), DeviceOption("b", 0)))
 
 
 # Whatever happens
@@ -498,7 +500,7 @@ def test_whatever_is_on_the_bus_each_name_and_number_is_registered_once_and_befo
     ids=["recorded", "not UTF-8", "a name twice"],
 )
 def test_what_a_webots_robot_sent_passes_the_bus_and_reaches_a_controller_as_it_was(sent: bytes) -> None:
-    robot, scene = Wc2EcRobot(Options()), Scene("client")
+    robot, scene = Wc2EcRobot(Wc2EcOptions()), Scene("client")
     session = robot.session("robot", "tcp://robot.test:1")
     session.open(0.0)
     written = b""

@@ -7,7 +7,7 @@ import struct
 import msgpack
 import pytest
 
-from gateways.wc2ec.settings import Options
+from gateways.wc2ec.options import Wc2EcOptions
 from gateways.wc2ec.translate import Wc2EcRobot
 from tests.gateways.wc2ec.golden import DISTANCE, data, registration
 from zbridge.bus import Publisher
@@ -57,7 +57,7 @@ class Webots:
         self.bus, self.metrics, self.connected = CountingBus(), Metrics(), asyncio.Event()
         self.conversation: Conversation
         self.device = Device(
-            Wc2EcRobot(Options()),
+            Wc2EcRobot(Wc2EcOptions()),
             (Address("robot.test", 27015),),
             protocol="wc2ec",
             keys=KeySpace("fleet", "r1"),

@@ -6,7 +6,7 @@ import pytest
 from gateways.wc2ec.messages import Error, RegisterSensor, SensorData, SetSensor, SetValue, Wc2EcMessage
 from gateways.wc2ec.session import ControllerRole, ExternalRole, Wc2EcSession
 from tests.gateways.rig import drained
-from tests.gateways.wc2ec.golden import DEPLOYED, DRAFT, Dialect
+from tests.gateways.wc2ec.golden import DEPLOYED, DRAFT, Wc2EcDialect
 from zbridge.errors import EncodeError
 from zbridge.protocol.session import Role, State
 
@@ -24,13 +24,13 @@ SAID = {
 """Bytes, and the message that they complete."""
 
 
-def external(dialect: Dialect = DEPLOYED) -> ExternalRole:
+def external(dialect: Wc2EcDialect = DEPLOYED) -> ExternalRole:
     session = ExternalRole(dialect)
     session.open(0.0)
     return session
 
 
-def controller(dialect: Dialect = DEPLOYED, values: int = 3) -> ControllerRole:
+def controller(dialect: Wc2EcDialect = DEPLOYED, values: int = 3) -> ControllerRole:
     session = ControllerRole(dialect, values=values)
     session.open(0.0)
     return session

@@ -7,7 +7,7 @@ import pytest
 
 from gateways.wc2ec import PROTOCOL
 from gateways.wc2ec.messages import ChangeSensor, DisableSensor, EnableSensor, SetSensor, SetValue
-from gateways.wc2ec.simulator import DEVICES, Machine
+from gateways.wc2ec.simulator import DEVICES, WebotsMachine
 from tests.gateways.rig import planned
 from zbridge.errors import ConfigError
 from zbridge.protocol.address import Address
@@ -21,29 +21,29 @@ RADIUS_M, TRACK_M = 0.05, 0.3
 """What the options of the simulated robot say."""
 
 
-def machine(x: float = 0.0, y: float = 0.0, heading: float = 0.0) -> Machine:
-    made = Machine(1)
+def machine(x: float = 0.0, y: float = 0.0, heading: float = 0.0) -> WebotsMachine:
+    made = WebotsMachine(1)
     made.body.x, made.body.y, made.body.heading = x, y, heading
     return made
 
 
-def place(of: Machine) -> tuple[float, float, float]:
+def place(of: WebotsMachine) -> tuple[float, float, float]:
     return (of.body.x, of.body.y, of.body.heading)
 
 
-def drive(moved: Machine, left: float, right: float, seconds: float) -> None:
+def drive(moved: WebotsMachine, left: float, right: float, seconds: float) -> None:
     """Set both wheels, and let time pass."""
     moved.take(SetValue(53, LEFT, left))
     moved.take(SetValue(53, RIGHT, right))
     live(moved, seconds)
 
 
-def live(moved: Machine, seconds: float) -> None:
+def live(moved: WebotsMachine, seconds: float) -> None:
     for _ in range(round(seconds / STEP_S)):
         moved.step(STEP_S)
 
 
-def seen(by: Machine) -> list[float]:
+def seen(by: WebotsMachine) -> list[float]:
     return [reading.value for reading in by.distances()]
 
 
@@ -60,7 +60,7 @@ def test_it_registers_each_device_once_motors_included_and_its_options_fit_them(
 
 def test_the_same_seed_and_commands_give_the_same_world_and_another_seed_another() -> None:
     def story(seed: int) -> list[object]:
-        told = Machine(seed)
+        told = WebotsMachine(seed)
         drive(told, 5.0, 8.0, 1.0)
         told.take(EnableSensor(0, 1))
         return [place(told), seen(told), told.lights()]
@@ -72,7 +72,7 @@ def test_the_same_seed_and_commands_give_the_same_world_and_another_seed_another
 
 def test_it_begins_in_the_room_and_at_rest() -> None:
     for seed in range(20):
-        begun = Machine(seed)
+        begun = WebotsMachine(seed)
         before = place(begun)
         live(begun, 1.0)
         assert before == place(begun)

@@ -8,8 +8,8 @@ from typing import Any, Self
 import pytest
 
 from gateways.wc2ec import PROTOCOL
+from gateways.wc2ec.options import Wc2EcOptions
 from gateways.wc2ec.session import ExternalRole
-from gateways.wc2ec.settings import Options
 from gateways.wc2ec.translate import Wc2EcRobot
 from tests.conformance.scene import table
 from tests.gateways.rig import drained, planned
@@ -37,9 +37,9 @@ STOPPED = {0: 0.0, 1: 0.0, 2: 0.0, 3: 0.0}
 STAMP = 1_700_000_000_000_000_000
 
 
-def options_of(**options: Any) -> Options:
+def options_of(**options: Any) -> Wc2EcOptions:
     made = planned("wc2ec", **options).options
-    assert isinstance(made, Options)
+    assert isinstance(made, Wc2EcOptions)
     return made
 
 
@@ -421,7 +421,7 @@ def test_all_sensors_may_be_pinned_and_are_enabled_at_once() -> None:
 
 def test_the_defaults_are_those_of_the_page_and_a_webots_robot_has_one_link() -> None:
     options = options_of()
-    assert options == Options()
+    assert options == Wc2EcOptions()
     assert (options.dialect, options.motor_types.rotational, options.motor_types.linear) == ("deployed", (53,), (46,))
     with pytest.raises(ConfigError, match="link"):
         planned("wc2ec", 2)
@@ -457,7 +457,7 @@ def test_options_that_cannot_be_or_contradict_each_other_are_an_error_that_names
 
 def test_the_template_names_every_option() -> None:
     template = robot_template(PROTOCOL)
-    for name in Options.__struct_fields__:
+    for name in Wc2EcOptions.__struct_fields__:
         assert f"{name} = " in template or f"[device.options.{name}]" in template
 
 
@@ -469,7 +469,7 @@ def test_every_line_the_template_shows_as_left_out_can_be_put_in(dialect: str) -
     shown = "\n".join(line.removeprefix("# ") for line in fitting if "[[hq]]" not in line)
     shown = shown.replace('dialect = "deployed"', f'dialect = "{dialect}"')
     plan = config.plan(tomllib.loads(shown[: shown.index("[device.options.differential]")]))
-    assert isinstance(plan.device.options, Options)
+    assert isinstance(plan.device.options, Wc2EcOptions)
     assert [str(address) for address in plan.device.addresses] == ["tcp://127.0.0.1:27015"]
     assert plan.device.options.bearings_deg == {"front": 0.0, "left": 90.0}
     assert plan.device.options.pinned == (("light0",) if dialect == "draft" else ())

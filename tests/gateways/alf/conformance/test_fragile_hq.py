@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from gateways.alf.conformance.fragile_hq import FragileHq, simulate_fragile_hq
+from gateways.alf.conformance.fragile_hq import FragileAlfHq
 from gateways.alf.conformance.parser import Dialect
 from gateways.alf.conformance.parser import VehicleReader as Reader
 from tests.captures import stream
@@ -108,12 +108,12 @@ class Vehicle(AlfScene):
                 self.peer.tcp.send(bytes(65536))
 
 
-def viewer(dialect: Dialect = "text", **options: Any) -> FragileHq:
+def viewer(dialect: Dialect = "text", **options: Any) -> FragileAlfHq:
     """An HQ that sends nothing, of 5 points."""
-    return FragileHq(dialect=dialect, **{"points": POINTS, "repeat_s": None, "serves": "both", **options})
+    return FragileAlfHq(dialect=dialect, **{"points": POINTS, "repeat_s": None, "serves": "both", **options})
 
 
-async def played(hq: FragileHq, *steps: str) -> FragileHq:
+async def played(hq: FragileAlfHq, *steps: str) -> FragileAlfHq:
     """The HQ after a conversation."""
     peer = Listening()
     async with calling(hq, peer, Vehicle) as scene, asyncio.timeout(LONG_S):
@@ -190,7 +190,7 @@ async def test_the_program(options: dict[str, Any], steps: list[str]) -> None:
 
 @pytest.mark.parametrize(("name", "port", "scans"), [("alf-drive.hex", 16668, 0), ("alf-laser.hex", 16667, 6)])
 async def test_the_captures_have_no_violation(name: str, port: int, scans: int) -> None:
-    hq = FragileHq(repeat_s=None, serves="laser" if scans else "drive")
+    hq = FragileAlfHq(repeat_s=None, serves="laser" if scans else "drive")
     await played(hq, f"> {stream(name, source=port).hex()}", "close", "over", "ok")
     assert (hq.scans, len(hq.infos)) == (scans, 0 if scans else 6)
     assert [kind for _, kind, _ in hq.received] == ([2] + [1] * 6 if scans else [4] * 6) + [255]
@@ -199,7 +199,7 @@ async def test_the_captures_have_no_violation(name: str, port: int, scans: int) 
 def test_it_is_no_other_hq_and_sends_nothing_that_none_sends() -> None:
     for options in ({"dialect": "morse"}, {"serves": "tea"}):
         with pytest.raises(ValueError, match="no such HQ"):
-            FragileHq(**options)  # type: ignore[arg-type]
+            FragileAlfHq(**options)  # type: ignore[arg-type]
     for hq, *command in ((viewer(), 256), (viewer(), 0, 2), (viewer(), 0, 0, 91), (viewer("binary"), 0, 0, -1)):
         with pytest.raises(ValueError, match="speed"):
             hq.drive(*command)
@@ -215,7 +215,9 @@ async def test_lists_are_bounded_and_every_violation_is_told() -> None:
 
 async def test_the_program_logs_and_prints_what_it_died_of_and_nobody_listening_is_an_error(capsys, caplog) -> None:
     vehicle = Listening()
-    task = asyncio.create_task(simulate_fragile_hq("127.0.0.1", vehicle.port, dialect="text", points=POINTS))
+    task = asyncio.create_task(
+        FragileAlfHq(points=POINTS, serves="both", deployed="driving").simulate("127.0.0.1", vehicle.port, None)
+    )
     async with asyncio.timeout(LONG_S):
         await vehicle.accept()
         await vehicle.send_bytes(b"3|1;4|nan;")

@@ -13,15 +13,16 @@ from typing import Any
 import pytest
 
 from gateways.alf.conformance import parser
-from gateways.alf.conformance.fragile_hq import FragileHq
-from gateways.alf.conformance.fragile_robot import FragileVehicle, simulate_fragile
-from gateways.alf.conformance.machine import Machine
-from gateways.alf.conformance.parser import Dialect, Repeats, Times
+from gateways.alf.conformance.fragile_hq import FragileAlfHq
+from gateways.alf.conformance.fragile_robot import FragileVehicle, fragile_vehicle
+from gateways.alf.conformance.machine import JudgedVehicle
+from gateways.alf.conformance.parser import AlfTimes, Dialect, Repeats
 from tests.captures import payloads
 from tests.conformance.scene import LONG_S, Peer, serving, until
 from tests.gateways.alf.conformance.scene import DIALECTS, MESSAGES, AlfScene, conversations
+from zbridge.protocol import Address, Simulation
 
-QUICK = Times(
+QUICK = AlfTimes(
     cycle_s=0.005, scan_s=0.02, info_s=0.05, first_s=5, gap_s=5, window_commands=0, flight_s=0.05, answer_s=0.15,
     close_s=0.15, motor_s=0.1,
 )  # fmt: skip
@@ -102,22 +103,22 @@ def test_the_cut_does_not_depend_on_the_reads_and_random_bytes_never_make_the_ju
 @pytest.mark.parametrize(
     ("times", "commands", "problems"),
     [
-        (Times(), [1] * 500, {}),
-        (Times(), [1, 0] * 250, {}),
-        (Times(), [1] * 5 + [0] * 100 + [1] * 100, {10: "no drive command for 0.12 s"}),
-        (Times(), [0] * 20, {12: "no drive command for 0.26 s"}),
-        (Times(cycle_s=0.03125), [1, 0] * 32, dict.fromkeys((31, 63), "16 drive commands in 1.00 s")),
+        (AlfTimes(), [1] * 500, {}),
+        (AlfTimes(), [1, 0] * 250, {}),
+        (AlfTimes(), [1] * 5 + [0] * 100 + [1] * 100, {10: "no drive command for 0.12 s"}),
+        (AlfTimes(), [0] * 20, {12: "no drive command for 0.26 s"}),
+        (AlfTimes(cycle_s=0.03125), [1, 0] * 32, dict.fromkeys((31, 63), "16 drive commands in 1.00 s")),
     ],
     ids=["every 20 ms", "every 40 ms", "a gap is noted once", "the first has more time", "every 62 ms"],
 )
-def test_a_rhythm_that_is_too_slow_is_noted(times: Times, commands: list[int], problems: dict[int, str]) -> None:
+def test_a_rhythm_that_is_too_slow_is_noted(times: AlfTimes, commands: list[int], problems: dict[int, str]) -> None:
     repeats = Repeats(times)
     told = [repeats.cycle(times.cycle_s, count) for count in commands]
     assert {cycle: problem for cycle, problem in enumerate(told) if problem} == problems
 
 
 def test_the_recorded_hq_is_not_reproached() -> None:
-    reader, repeats = parser.reader("text", {3, 255}, 100), Repeats(Times())
+    reader, repeats = parser.reader("text", {3, 255}, 100), Repeats(AlfTimes())
     records = payloads("alf-drive.hex", destination=16668)
     heard = [(record.seconds, one.problem) for record in records for one in reader.take(record.payload)]
     assert [problem for _, problem in heard] == [""] * 115
@@ -127,7 +128,7 @@ def test_the_recorded_hq_is_not_reproached() -> None:
 
 def test_any_number_of_points_has_its_valid_indices_inside_and_a_seed_gives_the_same_measurement() -> None:
     for points in (1, 10, 726, 1081):
-        one, two = (Machine(random.Random(5), points).measure() for _ in range(2))
+        one, two = (JudgedVehicle(random.Random(5), points).measure() for _ in range(2))
         assert one == two
         assert len(one) == points + 2
         assert 0 <= one[-2] <= one[-1] < points
@@ -198,11 +199,11 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "binary": {"dialect": "binary"},
     "laser": LASER,
     "both": {"laser": True},
-    "deployed": {"times": Times()},
-    "eager": {"times": Times(first_s=0.06)},
-    "strict": {"times": Times(gap_s=0.05)},
-    "patient": {"times": Times(cycle_s=0.005, scan_s=0.0, first_s=50, send_s=0.1), "points": 100_000},
-    "hasty": {"times": Times(first_s=0.05, gap_s=0.05, window_s=0.1)},
+    "deployed": {"times": AlfTimes()},
+    "eager": {"times": AlfTimes(first_s=0.06)},
+    "strict": {"times": AlfTimes(gap_s=0.05)},
+    "patient": {"times": AlfTimes(cycle_s=0.005, scan_s=0.0, first_s=50, send_s=0.1), "points": 100_000},
+    "hasty": {"times": AlfTimes(first_s=0.05, gap_s=0.05, window_s=0.1)},
 }
 
 
@@ -262,7 +263,7 @@ async def test_an_hq_may(options: dict[str, Any], steps: list[str]) -> None:
 
 
 async def test_a_process_that_is_late_itself_reproaches_nobody() -> None:
-    async with connected(quick(times=Times())) as hq:
+    async with connected(quick(times=AlfTimes())) as hq:
         repeating = asyncio.create_task(hq.repeat(f"GOOD {LONG_S}"))
         await hq.play(["stall 0.25", "wait 0.08"] * 2)
         repeating.cancel()
@@ -271,7 +272,7 @@ async def test_a_process_that_is_late_itself_reproaches_nobody() -> None:
 
 async def test_the_motor_stops_two_seconds_after_the_last_command_as_the_deployed_one_does() -> None:
     """20 cycles of 20 ticks at 200 Hz ("Dialect `text`", 3)."""
-    vehicle = quick(times=Times(first_s=5, gap_s=5, window_commands=0))
+    vehicle = quick(times=AlfTimes(first_s=5, gap_s=5, window_commands=0))
     async with connected(vehicle) as hq:
         await hq.play(["> GOOD FORWARD", "? 2 s without a command: the motor stopped by itself, moving"])
     assert time.monotonic() - vehicle.received[-1][0] > 1.9
@@ -292,7 +293,7 @@ async def test_the_motor_stops_by_itself_and_any_message_applies_the_stale_comma
 async def test_an_end_goes_behind_a_measurement_that_is_being_sent_and_none_where_it_is_left_in_part(
     steps: list[str], ended: bool
 ) -> None:
-    times = Times(cycle_s=0.005, scan_s=0.0, close_s=LONG_S)
+    times = AlfTimes(cycle_s=0.005, scan_s=0.0, close_s=LONG_S)
     async with connected(quick("binary", **LASER, times=times, points=1_000_000)) as hq:
         await hq.play(["wait 0.3", *steps])
         said = await hq.peer.read_to_the_end()
@@ -318,7 +319,7 @@ async def test_neither_judge_finds_fault_with_the_other(dialect: Dialect) -> Non
     vehicle = FragileVehicle(dialect, laser=True, drive=True)
     straight, right, one_g = (0, 30, 1.0) if dialect == "text" else (90, 120, 1000)
     async with serving(vehicle, Peer, AlfScene) as scene, asyncio.timeout(4 * LONG_S):
-        hq = FragileHq(dialect=dialect, serves="both")
+        hq = FragileAlfHq(dialect=dialect, serves="both")
         task = asyncio.create_task(hq.run("127.0.0.1", scene.peer.port))
         await until(lambda: hq.scans >= 2, hq)
         hq.drive(80, 0, right, True)
@@ -344,26 +345,19 @@ async def test_neither_judge_finds_fault_with_the_other(dialect: Dialect) -> Non
 # As a process
 
 
-async def simulating(laser_port: int | None, dialect: Dialect = "text") -> list[Hq]:
-    ports: asyncio.Future[list[int]] = asyncio.get_running_loop().create_future()
-    run = simulate_fragile(
-        "127.0.0.1",
-        0,
-        dialect=dialect,
-        laser_port=laser_port,
-        seed=3,
-        ready=lambda drive, laser: ports.set_result([drive, laser] if laser else [drive]),
-        times=QUICK,
-    )
-    task = asyncio.create_task(run)
-    scenes = [Hq(None, Peer(port), task) for port in await ports]
+async def simulating(servers: int, dialect: Dialect = "text") -> list[Hq]:
+    bound: asyncio.Future[tuple[Address, ...]] = asyncio.get_running_loop().create_future()
+    simulation = Simulation((Address("127.0.0.1", 0),) * servers, ready=bound.set_result)
+    first, *others = fragile_vehicle(dialect, servers=servers, seed=3, times=QUICK)
+    task = asyncio.create_task(first.simulate(simulation, *others))
+    scenes = [Hq(None, Peer(address.port), task) for address in await bound]
     for scene in scenes:
         await scene.connect("")
     return scenes
 
 
 async def test_two_servers_share_the_work_and_are_one_vehicle(caplog: pytest.LogCaptureFixture) -> None:
-    hq, eye = await simulating(0)
+    hq, eye = await simulating(2)
     async with asyncio.timeout(4 * LONG_S):
         assert (await eye.read())[0] == "2"
         before = after = (await eye.read())[3 + 44 : 3 + 726]
@@ -382,7 +376,7 @@ async def test_two_servers_share_the_work_and_are_one_vehicle(caplog: pytest.Log
 
 
 async def test_the_simulator_logs_violations_and_says_what_it_died_of(caplog, capsys) -> None:
-    (hq,) = await simulating(None, "binary")
+    (hq,) = await simulating(1, "binary")
     await hq.play(["> 48", "over", "close"])
     assert capsys.readouterr().out.startswith("died: id 72, of which this server knows nothing")
     assert [record.levelno for record in caplog.records if "violation" in record.message] == [logging.ERROR]

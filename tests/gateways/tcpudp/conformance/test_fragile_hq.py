@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from gateways.tcpudp.conformance.fragile_hq import FragileHq, HqTimes, simulate_fragile_hq
-from gateways.tcpudp.conformance.parser import Feature
+from gateways.tcpudp.conformance.fragile_hq import FragileTcpUdpHq, HqTimes
+from gateways.tcpudp.conformance.parser import FeatureFlag
 from tests import captures
 from tests.conformance.scene import Listening, calling, table, until
 from tests.gateways.tcpudp.conformance.udp_scene import NAMES as SHARED
@@ -128,13 +128,13 @@ class Robot(UdpScene):
 
 
 @contextlib.asynccontextmanager
-async def facing(hq: FragileHq) -> AsyncIterator[Robot]:
+async def facing(hq: FragileTcpUdpHq) -> AsyncIterator[Robot]:
     async with calling(hq, Sockets(), Robot) as robot:
         yield robot
 
 
-def program(version: str = "1.3", **options: Any) -> FragileHq:
-    return FragileHq(version=version, **{"repeat_s": None, "unasked": True, **options})
+def program(version: str = "1.3", **options: Any) -> FragileTcpUdpHq:
+    return FragileTcpUdpHq(version=version, **{"repeat_s": None, "unasked": True, **options})
 
 
 HQS: dict[str, dict[str, Any]] = {
@@ -290,7 +290,7 @@ async def test_a_robot_that_behaves_is_not_reproached(version: str, udp: bool) -
         assert (hq.client_id, hq.alive, robot.task.done()) == (7, True, False)
         assert hq.settings is not None
         assert (hq.settings.map_size, hq.settings.map_interval) == ((200, 10) if version == "1.3" else (0, 0))
-        assert (Feature.UDP in hq.settings.features, Feature.CHAT in hq.settings.features) == (udp, True)
+        assert (FeatureFlag.UDP in hq.settings.features, FeatureFlag.CHAT in hq.settings.features) == (udp, True)
 
 
 async def test_a_captured_robot_is_reproached_for_what_the_page_forbids_the_gateway_only() -> None:
@@ -357,7 +357,7 @@ async def test_every_packet_of_the_operator_is_that_of_the_page() -> None:
 async def test_the_command_logs_violations_and_prints_the_death(caplog, capsys) -> None:
     sockets = Sockets()
     with caplog.at_level(logging.ERROR):
-        task = asyncio.create_task(simulate_fragile_hq("127.0.0.1", sockets.port, version="1.1", udp=False))
+        task = asyncio.create_task(FragileTcpUdpHq(version="1.1", udp=False).simulate("127.0.0.1", sockets.port, None))
         await Robot(None, sockets, task).play(["shake 1.1", "< STOP", "> 02000000 01 3c", "over"])
     sockets.close()
     assert "violation: unknown packet id 60" in caplog.text

@@ -11,14 +11,16 @@ from typing import Any
 
 import pytest
 
-from gateways.tcpudp.conformance.fragile_robot import FragileRobot, Loss, simulate_fragile
-from gateways.tcpudp.conformance.parser import Feature, Times
+from gateways.tcpudp.conformance.fragile_robot import FragileRobot
+from gateways.tcpudp.conformance.machine import Loss, Quirks
+from gateways.tcpudp.conformance.parser import FeatureFlag, RobotTimes
 from tests import captures
 from tests.conformance.scene import LONG_S, Peer, serving, table, until
 from tests.gateways.tcpudp.conformance.udp_scene import NAMES as SHARED
 from tests.gateways.tcpudp.conformance.udp_scene import UdpScene
+from zbridge.protocol import Address, Simulation
 
-QUICK = Times(read_s=0.002, probe_s=0.3, silence_s=0.3, part_s=0.08, flight_s=0.1, unasked_s=0)
+QUICK = RobotTimes(read_s=0.002, probe_s=0.3, silence_s=0.3, part_s=0.08, flight_s=0.1, unasked_s=0)
 CLIENT = 7
 VERSIONS = ("1.1", "1.2", "1.3", "1.4")
 HELLO = {
@@ -119,7 +121,9 @@ async def facing(robot: FragileRobot) -> AsyncIterator[Hq]:
 
 
 def quick(version: str = "1.3", udp: bool = False, **options: Any) -> FragileRobot:
-    return FragileRobot(version=version, udp=udp, seed=1, **{"client_id": CLIENT, "times": QUICK, **options})
+    options = {"client_id": CLIENT, "times": QUICK, **options}
+    quirks = Quirks(**{name: options.pop(name) for name in Quirks.__struct_fields__ if name in options})
+    return FragileRobot(version=version, udp=udp, seed=1, quirks=quirks, **options)
 
 
 ROBOTS: dict[str, dict[str, Any]] = {
@@ -130,12 +134,12 @@ ROBOTS: dict[str, dict[str, Any]] = {
     **{f"{version} udp": {"version": version, "udp": True} for version in VERSIONS},
     "no probe": {"udp": True, "loss": Loss.PROBE},
     "no answer": {"udp": True, "loss": Loss.ANSWER},
-    "long silence": {"udp": True, "times": Times(read_s=0.002, probe_s=0.3, silence_s=1.0, unasked_s=0)},
-    "slow": {"times": Times(read_s=0.4, unasked_s=0)},
-    "talks": {"times": Times(unasked_s=0.005)},
+    "long silence": {"udp": True, "times": RobotTimes(read_s=0.002, probe_s=0.3, silence_s=1.0, unasked_s=0)},
+    "slow": {"times": RobotTimes(read_s=0.4, unasked_s=0)},
+    "talks": {"times": RobotTimes(unasked_s=0.005)},
     "keeps 2": {"keep": 2},
     "misnames": {"misnamed": 1.0},
-    "obeys": {"features": {Feature.CAM}, "obeys": {Feature.JOYSTICK}},
+    "obeys": {"features": {FeatureFlag.CAM}, "obeys": {FeatureFlag.JOYSTICK}},
     "no features": {"features": set()},
 }
 
@@ -260,7 +264,7 @@ async def test_what_an_hq_may_do(options: dict[str, Any], steps: list[str]) -> N
 @pytest.mark.parametrize("udp", [False, True])
 @pytest.mark.parametrize("version", VERSIONS)
 async def test_an_hq_that_behaves_is_not_reproached(version: str, udp: bool) -> None:
-    robot = quick(version, udp, times=Times(probe_s=0.3, silence_s=0.3, part_s=0.02, unasked_s=0.02))
+    robot = quick(version, udp, times=RobotTimes(probe_s=0.3, silence_s=0.3, part_s=0.02, unasked_s=0.02))
     drive = "by_udp" if udp else ">"
     async with facing(robot) as hq:
         await hq.play([f"greet {version}{' udp' * udp}", "> JOYSTICK_MODE", f"{drive} FORWARD", f"{drive} TURN"])
@@ -284,7 +288,7 @@ async def test_map_parts_cover_the_map_run_past_its_end_and_come_again_and_again
 
 
 async def test_it_talks_unasked_and_once_with_two_headers() -> None:
-    async with facing(quick("1.3", times=Times(unasked_s=0.01))) as hq:
+    async with facing(quick("1.3", times=RobotTimes(unasked_s=0.01))) as hq:
         await hq.greet("1.3")
         packets = [await hq.packet() for _ in range(18)]
         assert {packet[5] for packet in packets} == {1, 31, 40, 51, 53, 55, 60}
@@ -318,7 +322,7 @@ async def test_robots_of_1_1_and_1_2_ignore_the_first_packet_that_they_read_alon
 
 
 async def test_packets_back_to_back_are_held_against_the_hq() -> None:
-    robot = quick(times=Times(read_s=0.002, gap_s=0.01, unasked_s=0))
+    robot = quick(times=RobotTimes(read_s=0.002, gap_s=0.01, unasked_s=0))
     async with facing(robot) as hq:
         await hq.greet("1.3")
         for _ in range(50):  # a busy machine may excuse some
@@ -343,12 +347,12 @@ async def test_what_is_misread_follows_from_the_seed_and_is_shown() -> None:
 @pytest.mark.parametrize(
     ("name", "version", "udp", "obeys"),
     [
-        ("tcpudp-1.1-tcp.hex", "1.1", False, {Feature.JOYSTICK, Feature.LIDAR}),
-        ("tcpudp-1.3-udp.hex", "1.3", True, {Feature.JOYSTICK}),
+        ("tcpudp-1.1-tcp.hex", "1.1", False, {FeatureFlag.JOYSTICK, FeatureFlag.LIDAR}),
+        ("tcpudp-1.3-udp.hex", "1.3", True, {FeatureFlag.JOYSTICK}),
     ],
 )
-async def test_the_recorded_hq_is_not_reproached(name: str, version: str, udp: bool, obeys: set[Feature]) -> None:
-    features = {Feature.LIDAR_SIM, Feature.SLAM_MAP} if udp else set()
+async def test_the_recorded_hq_is_not_reproached(name: str, version: str, udp: bool, obeys: set[FeatureFlag]) -> None:
+    features = {FeatureFlag.LIDAR_SIM, FeatureFlag.SLAM_MAP} if udp else set()
     robot = quick(version, udp, client_id=1, features=features, obeys=obeys)
     said = captures.payloads(name, destination=11001)
     async with facing(robot) as hq:
@@ -371,11 +375,10 @@ async def test_a_datagram_from_another_socket_is_noted() -> None:
 
 
 async def test_the_simulator_logs_violations_and_says_what_it_died_of(caplog, capsys) -> None:
-    port: asyncio.Future[int] = asyncio.get_running_loop().create_future()
-    task = asyncio.create_task(
-        simulate_fragile("127.0.0.1", 0, version="1.3", udp=False, seed=3, ready=port.set_result)
-    )
-    hq = Hq(None, Peer(await port), task)
+    bound: asyncio.Future[tuple[Address, ...]] = asyncio.get_running_loop().create_future()
+    simulation = Simulation((Address("127.0.0.1", 0),), ready=bound.set_result)
+    task = asyncio.create_task(FragileRobot(version="1.3", udp=False, seed=3).simulate(simulation))
+    hq = Hq(None, Peer((await bound)[0].port), task)
     with contextlib.closing(hq.peer), contextlib.closing(hq.udp):
         await hq.connect("")
         client = (await hq.packet())[6]

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from gateways.wc2ec.conformance.fragile_hq import FragileController, simulate_fragile_hq
+from gateways.wc2ec.conformance.fragile_hq import FragileExternalController
 from tests.captures import stream
 from tests.conformance.scene import LONG_S, Listening, Scene, calling, table, until
 
@@ -73,7 +73,7 @@ class Talk(Scene):
 
 
 @contextlib.asynccontextmanager
-async def facing(controller: FragileController) -> AsyncIterator[Talk]:
+async def facing(controller: FragileExternalController) -> AsyncIterator[Talk]:
     async with calling(controller, Webots(), Talk) as talk:
         await talk.peer.accept()
         await controller.connected.wait()
@@ -134,12 +134,12 @@ async def facing(controller: FragileController) -> AsyncIterator[Talk]:
     },
 )
 async def test_what_a_webots_controller_may_do_and_what_not(options: dict[str, Any], steps: list[str]) -> None:
-    async with facing(FragileController(**options)) as talk:
+    async with facing(FragileExternalController(**options)) as talk:
         await talk.play(steps)
 
 
 async def test_the_capture_has_no_violation() -> None:
-    controller = FragileController()
+    controller = FragileExternalController()
     async with facing(controller) as talk:
         await talk.peer.send_bytes(stream("wc2ec-deployed.hex", source=27515))
         await talk.play(["close", "over", "ok"])
@@ -150,7 +150,7 @@ async def test_the_capture_has_no_violation() -> None:
 
 async def test_it_does_nothing_before_the_first_data_nor_after_an_end() -> None:
     for step in ("> MIST_F DATA", "close"):
-        controller = FragileController()
+        controller = FragileExternalController()
         async with facing(controller) as talk:
             await talk.play(["> WHEEL1", 'knows {"wheel1": 0}'])
             task = asyncio.create_task(controller.set("wheel1", 1.5))
@@ -167,18 +167,18 @@ async def test_it_does_nothing_before_the_first_data_nor_after_an_end() -> None:
 
 async def test_each_dialect_has_its_own_commands() -> None:
     with pytest.raises(ValueError, match="no command of dialect draft"):
-        await FragileController(dialect="draft").set(0, 1.0)
+        await FragileExternalController(dialect="draft").set(0, 1.0)
     with pytest.raises(ValueError, match="no command of dialect deployed"):
-        await FragileController().enable(0)
+        await FragileExternalController().enable(0)
     with pytest.raises(ConnectionError):
-        await FragileController(dialect="draft").enable(0)
+        await FragileExternalController(dialect="draft").enable(0)
     with pytest.raises(ValueError, match="no such controller"):
-        FragileController(dialect="morse")  # type: ignore[arg-type]
+        FragileExternalController(dialect="morse")  # type: ignore[arg-type]
 
 
 async def test_the_program_logs_and_prints_what_it_died_of(capsys, caplog) -> None:
     webots = Webots()
-    task = asyncio.create_task(simulate_fragile_hq("127.0.0.1", webots.port, dialect="deployed", split=True))
+    task = asyncio.create_task(FragileExternalController(split=True).simulate("127.0.0.1", webots.port, None))
     async with asyncio.timeout(LONG_S):
         await webots.accept()
         await webots.send(bytes.fromhex(NAMES["DATA"]) + b"\x09")

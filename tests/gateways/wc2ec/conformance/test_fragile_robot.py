@@ -12,12 +12,13 @@ from typing import Any
 
 import pytest
 
-from gateways.wc2ec.conformance.fragile_robot import FragileController, simulate_fragile
-from gateways.wc2ec.conformance.machine import Robot
-from gateways.wc2ec.conformance.parser import DEFAULT, Device, Dialect, Kind, Reader, Times
+from gateways.wc2ec.conformance.fragile_robot import FragileWebotsController
+from gateways.wc2ec.conformance.machine import JudgedWebots
+from gateways.wc2ec.conformance.parser import DEFAULT, DeviceKind, Dialect, ExternalReader, SimulatedDevice, Wc2EcTimes
 from tests.conformance.scene import LONG_S, Peer, Scene, serving, table, until
+from zbridge.protocol import Address, Simulation
 
-QUICK = Times(step_s=0.005, register_s=0.0, part_s=5)
+QUICK = Wc2EcTimes(step_s=0.005, register_s=0.0, part_s=5)
 """As quick as a test, and patient where patience is not what it is about."""
 DIALECTS: tuple[Dialect, ...] = ("deployed", "draft")
 DEVICES = [
@@ -113,24 +114,26 @@ class Talk(Scene):
 
 
 @contextlib.asynccontextmanager
-async def facing(controller: FragileController) -> AsyncIterator[Talk]:
+async def facing(controller: FragileWebotsController) -> AsyncIterator[Talk]:
     async with serving(controller, External, Talk) as talk:
         yield talk
 
 
-def quick(dialect: Dialect = "deployed", **options: Any) -> FragileController:
-    return FragileController(dialect, **{"times": QUICK, **options})
+def quick(dialect: Dialect = "deployed", **options: Any) -> FragileWebotsController:
+    return FragileWebotsController(dialect, **{"times": QUICK, **options})
 
 
 JUDGES: dict[str, dict[str, Any]] = {
     "deployed": {},
     "draft": {"dialect": "draft"},
     "draft of 1": {"dialect": "draft", "values": 1},
-    "slow": {"times": Times(step_s=0.005, register_s=0.3)},
-    "hasty": {"times": Times(step_s=0.005, register_s=0.0, part_s=0.05)},
+    "slow": {"times": Wc2EcTimes(step_s=0.005, register_s=0.3)},
+    "hasty": {"times": Wc2EcTimes(step_s=0.005, register_s=0.0, part_s=0.05)},
     "many devices": {
-        "devices": [Device(f"{number:03}" + "x" * 200, number, 37, Kind.DISTANCE) for number in range(255)],
-        "times": Times(step_s=0.0, register_s=0.0, send_s=0.1),
+        "devices": [
+            SimulatedDevice(f"{number:03}" + "x" * 200, number, 37, DeviceKind.DISTANCE) for number in range(255)
+        ],
+        "times": Wc2EcTimes(step_s=0.0, register_s=0.0, send_s=0.1),
     },
     "keeps 2": {"dialect": "draft", "keep": 2},
 }
@@ -238,7 +241,7 @@ def test_the_cut_does_not_depend_on_the_reads(dialect: Dialect, words: list[str]
     data = [bytes.fromhex(NAMES[word]) for word in words]
     stream = b"".join(data)
     for size in range(1, len(stream) + 1):
-        reader = Reader(dialect, DEFAULT[dialect], 3)
+        reader = ExternalReader(dialect, DEFAULT[dialect], 3)
         taken = [one for at in range(0, len(stream), size) for one in reader.take(stream[at : at + size])]
         assert [(one.raw, one.problem) for one in taken] == [(raw, "") for raw in data]
         assert reader.rest == b""
@@ -247,7 +250,7 @@ def test_the_cut_does_not_depend_on_the_reads(dialect: Dialect, words: list[str]
 def test_random_bytes_never_make_the_judge_raise() -> None:
     rng = random.Random(5)
     for number in range(600):
-        reader = Reader(DIALECTS[number % 2], DEFAULT[DIALECTS[number % 2]], 3)
+        reader = ExternalReader(DIALECTS[number % 2], DEFAULT[DIALECTS[number % 2]], 3)
         for size in (1, 7, 60):
             for one in reader.take(bytes(rng.choices(b"\x80\x81\x82\x83\x00\x01\x08\x35\x7f\xff", k=size))):
                 assert one.raw
@@ -255,7 +258,7 @@ def test_random_bytes_never_make_the_judge_raise() -> None:
 
 @pytest.mark.parametrize(("left", "right", "turn"), [(2, 2, 0), (1, 2, 1), (2, 1, -1)])
 def test_it_drives_as_its_wheels_turn_and_sees_the_wall_that_it_nears(left: float, right: float, turn: int) -> None:
-    robot = Robot(DEFAULT["deployed"], random.Random(1), 3)
+    robot = JudgedWebots(DEFAULT["deployed"], random.Random(1), 3)
     robot.place.x, robot.place.y, robot.place.heading = 4.0, 0.0, 0.0
     before = [value for _, value in robot.measure()]
     assert (before[0], before[4]) == (pytest.approx(500.0), 1000.0)
@@ -271,10 +274,10 @@ def test_it_drives_as_its_wheels_turn_and_sees_the_wall_that_it_nears(left: floa
 
 async def test_the_program_ends_with_its_external_controller_and_says_why(capsys, caplog) -> None:
     for said, words in (("", "the external controller left the robot at rest: closed"), ("ENABLE 84", "died: unknown")):
-        port: asyncio.Future[int] = asyncio.get_running_loop().create_future()
-        started = simulate_fragile("127.0.0.1", 0, dialect="draft", seed=3, ready=port.set_result, times=QUICK)
-        task = asyncio.create_task(started)
-        talk = Talk(None, External(await port), task)
+        bound: asyncio.Future[tuple[Address, ...]] = asyncio.get_running_loop().create_future()
+        simulation = Simulation((Address("127.0.0.1", 0),), ready=bound.set_result)
+        task = asyncio.create_task(FragileWebotsController("draft", seed=3, times=QUICK).simulate(simulation))
+        talk = Talk(None, External((await bound)[0].port), task)
         with contextlib.closing(talk.peer):
             await talk.play(["connect", f"> {said}", "shut", "over"])
         assert capsys.readouterr().out.startswith(words)
@@ -282,13 +285,13 @@ async def test_the_program_ends_with_its_external_controller_and_says_why(capsys
 
 
 def test_a_controller_that_cannot_be_is_refused() -> None:
-    two = [Device("a", 0, 37, Kind.DISTANCE), Device("a", 1, 37, Kind.DISTANCE)]
+    two = [SimulatedDevice("a", 0, 37, DeviceKind.DISTANCE), SimulatedDevice("a", 1, 37, DeviceKind.DISTANCE)]
     for dialect, devices, words in (
         ("morse", [], "no such controller"),
-        ("deployed", [Device("a", 255, 37, Kind.DISTANCE)], "out of range"),
-        ("deployed", [Device("ä" * 128, 0, 37, Kind.DISTANCE)], "a name of 256 bytes"),
+        ("deployed", [SimulatedDevice("a", 255, 37, DeviceKind.DISTANCE)], "out of range"),
+        ("deployed", [SimulatedDevice("ä" * 128, 0, 37, DeviceKind.DISTANCE)], "a name of 256 bytes"),
         ("deployed", two, "one name or number"),
-        ("draft", [Device("a", 0, 37, Kind.LIGHT)], "light sensors only"),
+        ("draft", [SimulatedDevice("a", 0, 37, DeviceKind.LIGHT)], "light sensors only"),
     ):
         with pytest.raises(ValueError, match=words):
-            FragileController(dialect, devices=devices)  # type: ignore[arg-type]
+            FragileWebotsController(dialect, devices=devices)  # type: ignore[arg-type]

@@ -11,20 +11,10 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, ClassVar
 
-from gateways.tcpudp.messages import (
-    DebugMessage,
-    OpaquePacket,
-    Packet,
-    ServerCamMode,
-    ServerGetSimulatedLidarData,
-    ServerLidarStatus,
-    ServerPosition,
-    ServerSLAMMap,
-    ServerSLAMMapPart,
-)
-from gateways.tcpudp.session import HqRole
+from gateways.tcpudp import messages as packets
+from gateways.tcpudp.options import NAME, TcpUdpOptions
+from gateways.tcpudp.session.hq_role import HqRole
 from gateways.tcpudp.settings import RobotSettings13, Settings
-from gateways.tcpudp.translate.options import NAME, Options
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Cells, FleetMessage, Map, Pose, Raw, Switch, Text
 from zbridge.protocol import Form, Kept, ProtocolError, Spare, Telemetry, Translate
@@ -46,7 +36,7 @@ class TelemetryTranslator(Kept):
         "_map_awaited": bool,
     }
 
-    def __init__(self, options: Options) -> None:
+    def __init__(self, options: TcpUdpOptions) -> None:
         self._options = options
         self._session: HqRole | None = None
         self._parts: bytearray | None = None
@@ -71,7 +61,7 @@ class TelemetryTranslator(Kept):
         """Give the map of the parts that came on this connection, None if none came; later cells replace older ones."""
         if self._parts is None:
             return None
-        ((_, shown),) = self._map(ServerSLAMMap(bytes(self._parts)), self._parts_ns)
+        ((_, shown),) = self._map(packets.ServerSLAMMap(bytes(self._parts)), self._parts_ns)
         return shown
 
     @property
@@ -85,7 +75,7 @@ class TelemetryTranslator(Kept):
 
     # Packets
 
-    def _pose(self, message: ServerPosition, stamp_ns: int) -> tuple[Telemetry, ...]:
+    def _pose(self, message: packets.ServerPosition, stamp_ns: int) -> tuple[Telemetry, ...]:
         unit_m = self._unit_m
         return (
             (
@@ -99,7 +89,7 @@ class TelemetryTranslator(Kept):
             ),
         )
 
-    def _map(self, message: ServerSLAMMap, stamp_ns: int) -> tuple[Telemetry, ...]:
+    def _map(self, message: packets.ServerSLAMMap, stamp_ns: int) -> tuple[Telemetry, ...]:
         """Turn x-major cells (index = x * side + y) into rows of y; cells other than 0, 1, 2 become unknown."""
         import numpy as np
 
@@ -113,7 +103,7 @@ class TelemetryTranslator(Kept):
         origin = self._options.map_origin or (half, half)
         return ((topics.MAP, Map(side, side, cell, origin, cells, stamp_ns=stamp_ns)),)
 
-    def _map_part(self, message: ServerSLAMMapPart, stamp_ns: int) -> tuple[Telemetry, ...]:
+    def _map_part(self, message: packets.ServerSLAMMapPart, stamp_ns: int) -> tuple[Telemetry, ...]:
         """Enter a part, cut at the end of the map. Give the map with its last part, or if a query waits."""
         assert self._session is not None
         self._parts_from = self._session.version
@@ -127,27 +117,27 @@ class TelemetryTranslator(Kept):
         self._parts_ns = stamp_ns
         if message.end < len(self._parts) and not self._map_awaited:
             return ()
-        return self._map(ServerSLAMMap(bytes(self._parts)), stamp_ns)
+        return self._map(packets.ServerSLAMMap(bytes(self._parts)), stamp_ns)
 
     def _cell_m(self, settings: Settings | None) -> float:
         interval = settings.slam_map_interval if isinstance(settings, RobotSettings13) else 0
         return interval * self._unit_m if interval > 0 else self._options.map_cell_m
 
-    def _text(self, message: DebugMessage, stamp_ns: int) -> tuple[Telemetry, ...]:
+    def _text(self, message: packets.DebugMessage, stamp_ns: int) -> tuple[Telemetry, ...]:
         return ((topics.TEXT, Text(message.text, "debug", stamp_ns=stamp_ns)),)
 
-    def _request(self, message: ServerGetSimulatedLidarData, stamp_ns: int) -> tuple[Telemetry, ...]:
+    def _request(self, message: packets.ServerGetSimulatedLidarData, stamp_ns: int) -> tuple[Telemetry, ...]:
         return ((topics.TEXT, Text("simulated lidar data", "request", stamp_ns=stamp_ns)),)
 
-    def _lidar(self, message: ServerLidarStatus, stamp_ns: int) -> tuple[Telemetry, ...]:
+    def _lidar(self, message: packets.ServerLidarStatus, stamp_ns: int) -> tuple[Telemetry, ...]:
         return ((topics.LIDAR, _switch(message.mode, stamp_ns)),)
 
-    def _camera(self, message: ServerCamMode, stamp_ns: int) -> tuple[Telemetry, ...]:
+    def _camera(self, message: packets.ServerCamMode, stamp_ns: int) -> tuple[Telemetry, ...]:
         return ((topics.CAMERA, _switch(message.mode, stamp_ns)),)
 
-    def _raw(self, message: Packet, stamp_ns: int) -> tuple[Telemetry, ...]:
+    def _raw(self, message: packets.Packet, stamp_ns: int) -> tuple[Telemetry, ...]:
         """Pass on unchanged what no fleet message holds."""
-        if isinstance(message, OpaquePacket):
+        if isinstance(message, packets.OpaquePacket):
             raw = Raw(message.id, message.body, stamp_ns=stamp_ns)
         else:
             raw = Raw(message.spec.id, message.spec.codec.encode(message), stamp_ns=stamp_ns)
@@ -188,12 +178,12 @@ def _switch(mode: int, stamp_ns: int) -> Switch:
     return Switch(mode == ON, stamp_ns=stamp_ns)
 
 
-_TELEMETRY: dict[type[Packet], Callable[[TelemetryTranslator, Any, int], tuple[Telemetry, ...]]] = {
-    ServerPosition: TelemetryTranslator._pose,
-    ServerSLAMMap: TelemetryTranslator._map,
-    ServerSLAMMapPart: TelemetryTranslator._map_part,
-    DebugMessage: TelemetryTranslator._text,
-    ServerGetSimulatedLidarData: TelemetryTranslator._request,
-    ServerLidarStatus: TelemetryTranslator._lidar,
-    ServerCamMode: TelemetryTranslator._camera,
+_TELEMETRY: dict[type[packets.Packet], Callable[[TelemetryTranslator, Any, int], tuple[Telemetry, ...]]] = {
+    packets.ServerPosition: TelemetryTranslator._pose,
+    packets.ServerSLAMMap: TelemetryTranslator._map,
+    packets.ServerSLAMMapPart: TelemetryTranslator._map_part,
+    packets.DebugMessage: TelemetryTranslator._text,
+    packets.ServerGetSimulatedLidarData: TelemetryTranslator._request,
+    packets.ServerLidarStatus: TelemetryTranslator._lidar,
+    packets.ServerCamMode: TelemetryTranslator._camera,
 }

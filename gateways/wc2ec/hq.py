@@ -1,36 +1,120 @@
-"""What controllers are shown of any robot: device registrations and sensor values, each encoded once. Sans-IO.
+"""One listener for external controllers: its clients, and what it shows them of any robot. Sans-IO.
 
-Source: "The gateway as Webots controller" of the protocol page.
+It shows device registrations and sensor values, each encoded once for all clients. The session of a client and its
+commands are in :mod:`.hq_client`, its devices in :mod:`.device_table`. Source: "The gateway as Webots controller" and
+the dialects of the protocol page.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from typing import Any, ClassVar
 
+import msgspec
+
+from gateways.wc2ec.device_table import DeviceTable, SectorSensors, ShownDevice
 from gateways.wc2ec.devices import DISTANCE
-from gateways.wc2ec.hq.client import HqClient
-from gateways.wc2ec.hq.device_table import DeviceTable, ShownDevice
-from gateways.wc2ec.hq.sectors import SectorSensors
-from gateways.wc2ec.messages import Dialect, SensorData, write
+from gateways.wc2ec.hq_client import ControllerCommands, Wc2EcClient
+from gateways.wc2ec.messages import MAX_FRAME, SensorData, Wc2EcDialect, Wc2EcMessage, write
+from gateways.wc2ec.options import Wc2EcHqOptions
 from gateways.wc2ec.translate import NAME
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Devices, FleetMessage, Reading, Scan, Scanner, Status
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
-from zbridge.protocol import Send
+from zbridge.protocol import ATTEND_S, HqSide, Limits, Metrics, RobotUser, Send, Telemetry
+
+DEADMAN_S = 0.5
+
+
+class Wc2EcHq(HqSide):
+    """One listener."""
+
+    name = NAME
+    hands_over = True
+    kept: ClassVar[dict[str, Any]] = {"_table": DeviceTable}
+    deadman_s = DEADMAN_S
+
+    def __init__(self, options: Wc2EcHqOptions, view: RobotView, metrics: Metrics | None = None) -> None:
+        self.options = options
+        self.view = view
+        self._dialect = Wc2EcDialect(options.dialect)
+        self._draft = self._dialect is Wc2EcDialect.DRAFT
+        self.follows = ("scan",) if self._draft else ("scan", "scanner", "devices", "sensor/*")
+        self._sessions: list[Wc2EcClient] = []
+        sectors = SectorSensors(options.sectors, options.sector_unit_m)
+        left_out = (metrics or Metrics()).count("hq_devices_left_out")
+        self._table = DeviceTable(options, view, sectors, self._registered, left_out)
+        self._display = Wc2EcDisplay(self._dialect, view, self._table, sectors)
+        self._commands = ControllerCommands(options, view, self._table)
+
+    # Clients
+
+    def session(self, number: int, bounds: Limits) -> Wc2EcClient:
+        self._sessions = [session for session in self._sessions if not session.over]
+        session = Wc2EcClient(
+            self._dialect,
+            values=self.options.values,
+            bounds=msgspec.structs.replace(bounds, frame_bytes=MAX_FRAME),
+        )
+        self._sessions.append(session)
+        return session
+
+    def begin(self, session: Wc2EcClient, now: float) -> None:
+        self._table.learn()
+        self._display.register(session, now)
+
+    def attend(self, client: RobotUser) -> None:
+        """Repeat what a controller set, as it sets a velocity once, until its machine falls silent (``hold``)."""
+        if self.options.hold:
+            if client.silent_s > self.deadman_s - ATTEND_S:
+                client.let_go("the connection is silent")
+            else:
+                client.repeat()
+
+    def _registered(self) -> set[int]:
+        """Return the numbers of the devices that some controller knows."""
+        return set[int]().union(*(session.registered for session in self._sessions if not session.over))
+
+    # What is shown
+
+    def show(self, topic: Topic, message: FleetMessage) -> Send | None:
+        return self._display.show(topic, message)
+
+    def presence(self, there: bool) -> Send | None:
+        return self._display.presence(there)
+
+    def wanted(self) -> tuple[Topic, ...]:
+        """List the sensors that some controller has enabled; controllers of the draft get no others."""
+        if not self._draft:
+            return ()
+        enabled = set().union(*(session.enabled for session in self._sessions if not session.over))
+        return tuple(topics.SENSOR(self._table.by_number[number].name) for number in sorted(enabled))
+
+    # What is understood
+
+    def take(self, session: Wc2EcClient, message: Wc2EcMessage) -> tuple[Telemetry, ...]:
+        return self._commands.take(session, message)
+
+    def deadline(self, session: Wc2EcClient) -> float:
+        return session.joined_at
+
+    def expire(self, session: Wc2EcClient, now: float) -> tuple[Telemetry, ...]:
+        return self._commands.expire(session, now)
+
 
 FAULT = -1.0
 """What a distance sensor shows when nothing is known: deployed controllers take it as a fault, while anything from
 0 to 1000 would be a false distance ("The gateway as Webots controller")."""
 
 
-class Display:
+class Wc2EcDisplay:
     """Shows one robot to the controllers of one listener."""
 
-    def __init__(self, dialect: Dialect, view: RobotView, table: DeviceTable, sectors: SectorSensors) -> None:
+    def __init__(self, dialect: Wc2EcDialect, view: RobotView, table: DeviceTable, sectors: SectorSensors) -> None:
         self._dialect = dialect
-        self._draft = dialect is Dialect.DRAFT
+        self._draft = dialect is Wc2EcDialect.DRAFT
         self._view = view
         self._table = table
         self._sectors = sectors
@@ -38,10 +122,10 @@ class Display:
         """The value that was encoded last of each device."""
         self._readings_gone: dict[str, Reading] = {}
         self._scan_gone: Scan | None = None
-        """The last readings and scan of a robot that was lost since: they say nothing about it now."""
+        """The last readings and scan of a robot that was lost since: they are out of date now."""
 
     def __repr__(self) -> str:
-        return f"<Display of {self._table!r}>"
+        return f"<Wc2EcDisplay of {self._table!r}>"
 
     def show(self, topic: Topic, message: FleetMessage) -> Send | None:
         """Encode a message for all controllers; None if there is nothing to show."""
@@ -63,7 +147,7 @@ class Display:
         self._readings_gone, self._scan_gone = dict(self._view.readings), self._view.scan
         return self._data((device, FAULT) for device in devices if device.kind == DISTANCE)
 
-    def register(self, session: HqClient, now: float) -> None:
+    def register(self, session: Wc2EcClient, now: float) -> None:
         """Register the devices that the controller does not know yet; a value of each sensor follows at once."""
         table = self._table
         new = [device for device in table.by_number.values() if device.number not in session.registered]
@@ -117,7 +201,7 @@ class Display:
         if not frames:
             return None
 
-        def send(session: HqClient, now: float) -> None:
+        def send(session: Wc2EcClient, now: float) -> None:
             for device, frame in frames:
                 self._queue(session, device, frame, now)
 
@@ -130,7 +214,7 @@ class Display:
             self._frames[device.number] = last
         return last[1]
 
-    def _queue(self, session: HqClient, device: ShownDevice, frame: bytes, now: float) -> None:
+    def _queue(self, session: Wc2EcClient, device: ShownDevice, frame: bytes, now: float) -> None:
         """Queue a value as the newest of its device, if the controller wants it."""
         if device.number not in session.registered:
             self.register(session, now)

@@ -1,6 +1,7 @@
-"""``[device.options]`` of WC2EC: the devices of a robot, what their values mean, and its kinematics. Sans-IO.
+"""Options of WC2EC in a configuration: of a robot, and of a listener for external controllers. Sans-IO.
 
-Source: the dialects of the protocol page; the template of ``zbridge init`` explains each option.
+A robot's options name its devices, the meaning of their values, and its kinematics. Source: the dialects of the
+protocol page; the templates of ``zbridge init`` explain each option.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class MotorNames(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     linear: tuple[str, ...] = ()
 
 
-class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Wc2EcOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[device.options]``; the template of ``zbridge init`` explains each."""
 
     dialect: Literal["deployed", "draft"] = "deployed"
@@ -92,3 +93,30 @@ def require_devices(dialect: str, devices: tuple[DeviceOption, ...]) -> None:
     for field in ("number", "name"):
         if len({getattr(device, field) for device in devices}) < len(devices):
             raise ConfigError(f"devices: a {field} twice")
+
+
+class Wheels(Differential, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The two sides of wheels that are shown of a robot without motors."""
+
+    wheel_radius_m: Positive = 0.05
+    track_m: Positive = 0.3
+
+
+class Wc2EcHqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[[hq]] options`` of this protocol; the template of ``zbridge init`` explains each."""
+
+    dialect: Literal["deployed", "draft"] = "deployed"
+    hold: bool = True
+    join_s: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.03
+    sectors: Annotated[int, msgspec.Meta(ge=1, le=128)] = 8
+    sector_unit_m: Positive = 1.0
+    wheels: Wheels = Wheels()
+    distance_type: Byte = 37
+    rotational_type: Byte = 53
+    linear_type: Byte = 46
+    devices: tuple[DeviceOption, ...] = ()
+    values: Byte = 3
+
+    def __post_init__(self) -> None:
+        """Raise ConfigError for options that contradict each other."""
+        require_devices(self.dialect, self.devices)

@@ -1,6 +1,7 @@
 """One robot of the TCP/UDP package protocol, seen from its HQ: commands to packets, and its stop. Sans-IO.
 
-Source: "Translation" and "The gateway as HQ" of the protocol page. Telemetry is translated by :mod:`.telemetry`.
+Source: "Translation", "Packets" (61) and "The gateway as HQ" of the protocol page. Telemetry is translated by
+:mod:`.telemetry`.
 
 Theory of operation of the stop. One slot of the outbox holds what is repeated: the packets of the last drive, or packet
 13. Packet 13 does not end mode 3, and no packet acknowledges a mode: a robot that stalls drops what piled up, another
@@ -17,28 +18,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from gateways.tcpudp.messages import (
-    PACKETS,
-    ChatMessage,
-    ClientControllMode,
-    ClientGetPosition,
-    ClientGetSLAMMap,
-    ClientJoystickMove,
-    ClientJoystickRotate,
-    ClientJoystickStop,
-    ClientMoveAI,
-    ClientSimulatedLidarData,
-    DebugMessage,
-    OpaquePacket,
-    Packet,
-)
-from gateways.tcpudp.session import HqRole, limits
+from gateways.tcpudp import messages as packets
+from gateways.tcpudp.options import NAME, TcpUdpOptions
+from gateways.tcpudp.session import limits
+from gateways.tcpudp.session.hq_role import HqRole
 from gateways.tcpudp.settings import Feature
-from gateways.tcpudp.translate.options import NAME, Options
-from gateways.tcpudp.translate.scans import polar_ranges
-from gateways.tcpudp.translate.telemetry import OFF, ON, TelemetryTranslator
+from gateways.tcpudp.telemetry import OFF, ON, TelemetryTranslator
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Mode, Raw, Scan, Switch, Text
 from zbridge.fleet.topics import Topic
@@ -53,6 +40,9 @@ from zbridge.protocol import (
     Translate,
     Unsupported,
 )
+
+if TYPE_CHECKING:
+    import numpy as np
 
 REPEAT_S = 0.25
 """Seconds after which a drive command is repeated while the robot moves."""
@@ -74,11 +64,11 @@ class TcpUdpRobot(Robot):
     hands_over = True
     kept: ClassVar[dict[str, Any]] = {
         "_chosen": str | None,
-        "_rests_until": float,
+        "_stop_until": float,
         "_telemetry": TelemetryTranslator,
     }
 
-    def __init__(self, options: Options, links: int = 1, metrics: Metrics | None = None) -> None:
+    def __init__(self, options: TcpUdpOptions, links: int = 1, metrics: Metrics | None = None) -> None:
         self.options = options
         self.link_names = ("robot",)
         self._force = tuple(Feature(entry) if isinstance(entry, str) else entry for entry in options.force)
@@ -87,7 +77,7 @@ class TcpUdpRobot(Robot):
         self._session: HqRole | None = None
         self._chosen: str | None = None
         """The mode that was commanded last."""
-        self._rests_until = -math.inf
+        self._stop_until = -math.inf
         """How long a stop or a neutral is repeated."""
         self._was_autonomous = False
         """Whether a gateway before this one may have sent mode 3."""
@@ -105,7 +95,7 @@ class TcpUdpRobot(Robot):
             predecessor=self._session,
         )
         self._session.sent_autonomous = self._session.sent_autonomous or self._was_autonomous
-        self._rests_until = -math.inf
+        self._stop_until = -math.inf
         self._telemetry.begin(self._session)
         return self._session
 
@@ -131,9 +121,9 @@ class TcpUdpRobot(Robot):
         if until > now:
             session.send_nothing_again()
         elif session.misreads:
-            self._rest(now, until=until)
+            self._repeat_stop(now, until=until)
             return
-        self._rest(now, period_s=STOP_REPEAT_S, until=until, urgent=True)
+        self._repeat_stop(now, period_s=STOP_REPEAT_S, until=until, urgent=True)
 
     def was_autonomous(self) -> None:
         """Send the pair of packets from the first stop on ("Stops after mode 3")."""
@@ -151,7 +141,7 @@ class TcpUdpRobot(Robot):
         return _sendable(session, self._stop_packets(paired=session.sent_autonomous or self._chosen == AUTONOMOUS))
 
     def begun(self, stamp_ns: int) -> tuple[Telemetry, ...]:
-        """Load numpy for a robot that has maps or takes scans: now, and not when the first one comes while it moves."""
+        """Load numpy for a robot with maps or simulated lidar: now, not with the first one while it moves."""
         session = self._session
         if session is not None and {Feature.SLAM_MAP.value, Feature.LIDAR_SIM.value} & set(session.features):
             import numpy  # noqa: F401
@@ -162,10 +152,10 @@ class TcpUdpRobot(Robot):
 
     def ask(self, topic: Topic) -> None:
         if topic is not topics.MAP:
-            self._send(ClientGetPosition())
+            self._send(packets.ClientGetPosition())
             return
         if not self._telemetry.sends_parts:
-            self._send(ClientGetSLAMMap())
+            self._send(packets.ClientGetSLAMMap())
         self._telemetry.await_map()
 
     def _drive(self, command: Drive, now: float) -> Outcome:
@@ -176,42 +166,44 @@ class TcpUdpRobot(Robot):
             self._neutral(session, now)
             return Outcome(left_out=left_out)
         translation = math.hypot(command.forward, command.left)
-        packets: list[Packet] = []
+        moves: list[packets.Packet] = []
         if translation:
             speed = min(1.0, translation) * self.options.speed_full
-            packets.append(ClientJoystickMove((0.0 - command.left) / translation, command.forward / translation, speed))
+            moves.append(
+                packets.ClientJoystickMove((0.0 - command.left) / translation, command.forward / translation, speed)
+            )
         if command.turn:
-            packets.append(ClientJoystickRotate(-command.turn * self.options.turn_full))
-        if len(packets) == 2 and self.options.combine == "exclusive":
+            moves.append(packets.ClientJoystickRotate(-command.turn * self.options.turn_full))
+        if len(moves) == 2 and self.options.combine == "exclusive":
             rotates = abs(command.turn) > translation
-            packets = packets[1:] if rotates else packets[:1]
+            moves = moves[1:] if rotates else moves[:1]
             left_out = f"{'forward and left' if rotates else 'turn'}: options.combine = 'exclusive'"
         session = self._connected()
-        frames = tuple(session.encode(packet) for packet in packets)
+        frames = tuple(session.encode(packet) for packet in moves)
         session.outbox.set(_MOTION, frames, now, period_s=REPEAT_S)
-        self._rests_until = -math.inf
+        self._stop_until = -math.inf
         return Outcome(left_out=left_out) if left_out else _NOTHING
 
     def _neutral(self, session: HqRole, now: float) -> None:
-        """Repeat neutral for a second. Where it is repeated already, at its own times: programs say it all the time."""
+        """Repeat neutral for a second. If it is already repeated, keep its times: programs send it all the time."""
         until = now + NEUTRAL_S
         frames = _sendable(session, self._stop_packets(paired=session.sent_autonomous))
         if session.outbox.prolong(_MOTION, frames, period_s=REPEAT_S, until=until):
-            self._rests_until = max(self._rests_until, until)
+            self._stop_until = max(self._stop_until, until)
         else:
-            self._rest(now, period_s=REPEAT_S, until=until, urgent=session.sent_autonomous)
+            self._repeat_stop(now, period_s=REPEAT_S, until=until, urgent=session.sent_autonomous)
 
     def _mode(self, command: Mode, now: float) -> None:
         """Send the mode. While a stop is repeated: mode 3 ends it, any other mode replaces that of the pair."""
         session = self._connected()
         session.choose_mode(_MODES[command.mode], now)
         self._chosen = command.mode
-        if now >= self._rests_until:
+        if now >= self._stop_until:
             return
         if command.mode == AUTONOMOUS:
             session.outbox.clear(_MOTION)
         elif session.sent_autonomous:
-            self._rest(now, period_s=STOP_REPEAT_S, until=self._rests_until)
+            self._repeat_stop(now, period_s=STOP_REPEAT_S, until=self._stop_until)
 
     def _switch_lidar(self, command: Switch, now: float) -> None:
         self._connected().switch_lidar(ON if command.on else OFF, now)
@@ -219,22 +211,22 @@ class TcpUdpRobot(Robot):
     def _switch_camera(self, command: Switch, now: float) -> None:
         raise Unsupported("no packet turns a camera on or off")
 
-    def _say(self, command: Text, now: float) -> None:
+    def _send_text(self, command: Text, now: float) -> None:
         if command.kind != "debug":
             raise Unsupported(f"text of kind {command.kind!r}: only 'debug' has a packet; chat is opaque, send it raw")
-        self._send(DebugMessage(command.text))
+        self._send(packets.DebugMessage(command.text))
 
-    def _feed_scan(self, command: Scan, now: float) -> Outcome:
-        self._send(ClientSimulatedLidarData(polar_ranges(command, self.options.length_unit_m)))
+    def _send_scan(self, command: Scan, now: float) -> Outcome:
+        self._send(packets.ClientSimulatedLidarData(polar_ranges(command, self.options.length_unit_m)))
         return Outcome(telemetry=((topics.SCAN, command),))
 
     def _send_raw(self, command: Raw, now: float) -> None:
         self._connected().send_raw(_raw_packet(command))
 
-    def _send(self, message: Packet) -> None:
+    def _send(self, message: packets.Packet) -> None:
         self._connected().send(message)
 
-    def _rest(self, now: float, *, until: float, period_s: float = math.inf, urgent: bool = False) -> None:
+    def _repeat_stop(self, now: float, *, until: float, period_s: float = math.inf, urgent: bool = False) -> None:
         """Repeat the packets of a stop; raise Refused if the robot may be sent none of them."""
         session, spacing_s = self._connected(), 0.0
         frames = _sendable(session, self._stop_packets(paired=session.sent_autonomous))
@@ -242,12 +234,13 @@ class TcpUdpRobot(Robot):
             spacing_s = IDLE_STOP_S / 2
             period_s = max(period_s, spacing_s)
         session.outbox.set(_MOTION, frames, now, period_s=period_s, until=until, spacing_s=spacing_s, urgent=urgent)
-        self._rests_until = until
+        self._stop_until = until
 
-    def _stop_packets(self, *, paired: bool) -> tuple[Packet, ...]:
+    def _stop_packets(self, *, paired: bool) -> tuple[packets.Packet, ...]:
         """Packet 13; ``paired``: after a mode that ends mode 3, the one that the holder wants or none."""
         mode = _MODES["manual" if self._chosen == "manual" else "none"]
-        return (ClientControllMode(mode), ClientJoystickStop()) if paired else (ClientJoystickStop(),)
+        stop = packets.ClientJoystickStop()
+        return (packets.ClientControllMode(mode), stop) if paired else (stop,)
 
     def _connected(self) -> HqRole:
         if self._session is None:
@@ -255,10 +248,10 @@ class TcpUdpRobot(Robot):
         return self._session
 
 
-def _sendable(session: HqRole, packets: Iterable[Packet]) -> tuple[bytes, ...]:
+def _sendable(session: HqRole, wanted: Iterable[packets.Packet]) -> tuple[bytes, ...]:
     """Write the packets that the robot may be sent; raise Refused if it may be sent none of them."""
     frames, refusal = [], None
-    for packet in packets:
+    for packet in wanted:
         try:
             frames.append(session.encode(packet))
         except Refused as refused:
@@ -268,17 +261,17 @@ def _sendable(session: HqRole, packets: Iterable[Packet]) -> tuple[bytes, ...]:
     return tuple(frames)
 
 
-def _raw_packet(command: Raw) -> Packet:
+def _raw_packet(command: Raw) -> packets.Packet:
     """Make the packet of a raw command; raise Refused if a fleet message holds that packet."""
-    spec = PACKETS.get(command.id)
+    spec = packets.PACKETS.get(command.id)
     if spec is None:
         if not 0 <= command.id <= 255:
             raise Malformed(f"packet id {command.id}, expected 0 to 255")
-        return OpaquePacket(command.id, command.body)
-    if spec.packet is ClientMoveAI:
-        return ClientMoveAI(command.body)
-    if spec.packet is ChatMessage:
-        return ChatMessage(command.body)
+        return packets.OpaquePacket(command.id, command.body)
+    if spec.packet is packets.ClientMoveAI:
+        return packets.ClientMoveAI(command.body)
+    if spec.packet is packets.ChatMessage:
+        return packets.ChatMessage(command.body)
     raise Unsupported(f"{spec.name} ({spec.id}) is not raw: use the command or query that holds it")
 
 
@@ -287,7 +280,44 @@ _COMMANDS: dict[str, Callable[[TcpUdpRobot, Any, float], Outcome | None]] = {
     topics.CMD_MODE.path: TcpUdpRobot._mode,
     topics.CMD_LIDAR.path: TcpUdpRobot._switch_lidar,
     topics.CMD_CAMERA.path: TcpUdpRobot._switch_camera,
-    topics.CMD_TEXT.path: TcpUdpRobot._say,
-    topics.CMD_SCAN.path: TcpUdpRobot._feed_scan,
+    topics.CMD_TEXT.path: TcpUdpRobot._send_text,
+    topics.CMD_SCAN.path: TcpUdpRobot._send_scan,
     topics.CMD_RAW(NAME).path: TcpUdpRobot._send_raw,
 }
+
+
+SCAN_POINTS = 360
+"""Points deployed robots take in simulated lidar data, one a degree."""
+
+
+def polar_ranges(scan: Scan, unit_m: float) -> np.ndarray[Any, np.dtype[np.float32]]:
+    """Resample a scan to float32[360] in the robot's unit, index = degree counter-clockwise from straight ahead.
+
+    Each degree takes the nearest point of the scan, 0 where the scan has none or it is invalid or out of range.
+    """
+    import numpy as np
+
+    with np.errstate(all="ignore"):  # a point with an absurd number counts as not measured
+        return _polar(scan, unit_m)
+
+
+def _polar(scan: Scan, unit_m: float) -> np.ndarray[Any, np.dtype[np.float32]]:
+    import numpy as np
+
+    count = len(scan.ranges)
+    polar = np.zeros(SCAN_POINTS, np.float32)
+    if count == 0 or not scan.angle_increment or not math.isfinite(scan.angle_increment + scan.angle_min):
+        return polar
+    step = abs(scan.angle_increment)
+    circle = 2 * math.pi / step
+    offsets = np.radians(np.arange(SCAN_POINTS)) - scan.angle_min
+    nearest = np.rint(np.mod(math.copysign(1.0, scan.angle_increment) * offsets, 2 * math.pi) / step)
+    nearest = np.where(nearest >= circle - 0.5, 0.0, nearest)  # after the last point comes the first
+    covered = nearest < count
+    indices = nearest[covered].astype(np.int64)
+    ranges = np.asarray(scan.ranges, np.float32)
+    values = ranges[indices]
+    usable = np.isfinite(values) & (values >= scan.range_min) & (values <= scan.range_max)
+    lengths = values / np.float32(unit_m)
+    polar[covered] = np.where(usable & np.isfinite(lengths), lengths, 0)
+    return polar

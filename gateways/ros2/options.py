@@ -13,7 +13,7 @@ TOPICS = ("scan", "odom", "map", "imu", "battery_state", "image")
 """The options that name topics which the robot publishes."""
 
 
-class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class RosOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[device.options]``; the template of ``zbridge init`` explains each. A topic ``""`` is not used."""
 
     namespace: str = ""

@@ -1,4 +1,4 @@
-"""The devices that controllers are told a robot has. Sans-IO.
+"""The devices that external controllers see of a robot, sectors of its scan among them. Sans-IO.
 
 Each device keeps its name and number while any controller knows it: controllers learn each number once. Only when no
 number is left, devices that the robot has no longer and that no controller knows give theirs up.
@@ -14,14 +14,37 @@ from typing import Any, ClassVar
 import msgspec
 
 from gateways.wc2ec.devices import DISTANCE, LINEAR, ROTATIONAL
-from gateways.wc2ec.hq.client import LEFT, RIGHT
-from gateways.wc2ec.hq.options import HqOptions
-from gateways.wc2ec.hq.sectors import SectorSensors
-from gateways.wc2ec.messages import Dialect, RegisterSensor, write
+from gateways.wc2ec.messages import RegisterSensor, Wc2EcDialect, write
+from gateways.wc2ec.options import Wc2EcHqOptions
 from gateways.wc2ec.translate import NAME
-from zbridge.fleet.messages import Device
+from zbridge.fleet.messages import Device, Scan, Scanner
 from zbridge.fleet.view import RobotView
-from zbridge.protocol import Count, Kept
+from zbridge.protocol import Count, Kept, Sectors
+
+LEFT, RIGHT = "left", "right"
+"""The motors of a robot that has none of its own."""
+
+
+class SectorSensors:
+    """``count`` sensors named ``sector0`` (ahead) and up, counter-clockwise. unit_m: metres for a value of 1."""
+
+    def __init__(self, count: int, unit_m: float) -> None:
+        self.names = [f"sector{number}" for number in range(count)]
+        self._unit_m = unit_m
+        self._sectors = Sectors(count)
+
+    def __repr__(self) -> str:
+        return f"<SectorSensors {len(self.names)}>"
+
+    def covered(self, geometry: Scan | Scanner) -> list[str]:
+        """Return the names of the sectors in which a scan, or a scanner, has points."""
+        return [self.names[sector] for sector in self._sectors.covered(geometry)]
+
+    def values(self, scan: Scan) -> dict[str, float]:
+        """Return the value of each sector that a scan covers: the nearest point, in ``unit_m``."""
+        nearest_m = self._sectors.nearest_m(scan)
+        return {self.names[sector]: range_m / self._unit_m for sector, range_m in nearest_m.items()}
+
 
 NUMBERS = 255
 """Device numbers there are: 0 to 254."""
@@ -57,7 +80,7 @@ class DeviceTable(Kept):
 
     def __init__(
         self,
-        options: HqOptions,
+        options: Wc2EcHqOptions,
         view: RobotView,
         sectors: SectorSensors,
         registered: Callable[[], set[int]],
@@ -72,8 +95,8 @@ class DeviceTable(Kept):
         self._sectors = sectors
         self._registered = registered
         self._unregistered = unregistered
-        self._dialect = Dialect(options.dialect)
-        self._draft = self._dialect is Dialect.DRAFT
+        self._dialect = Wc2EcDialect(options.dialect)
+        self._draft = self._dialect is Wc2EcDialect.DRAFT
         for device in options.devices:
             self._enter(device.name, device.number, device.kind)
 

@@ -14,9 +14,8 @@ from tests.camera.camera_bytes import HEAD, jpeg, part
 from tests.ports import free_port
 from zbridge.camera import relay as relays
 from zbridge.camera.demand import Demand
-from zbridge.camera.latest import Latest
 from zbridge.camera.mjpeg import MjpegReader
-from zbridge.camera.relay import Relay
+from zbridge.camera.relay import Latest, Relay
 from zbridge.camera.settings import CameraPlan, CameraSettings, Source
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address

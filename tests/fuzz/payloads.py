@@ -22,7 +22,7 @@ from zbridge.protocol.address import Address, parse_device_address
 from zbridge.protocol.samples import KeyedSample, SampleKind, read_sample, write_sample
 from zbridge.robot import ownership
 from zbridge.ros2 import Attachment, read_attachment, types_of
-from zbridge.ros2.tokens import read_token
+from zbridge.ros2.rmw_zenoh import read_token
 from zbridge.views.foxglove import requests
 from zbridge.views.foxglove.twist import Scale
 from zbridge.views.foxglove.twist import read_twist as read_json_twist
@@ -176,9 +176,9 @@ def targets() -> Iterator[Target]:
     yield Target("stop", read_stops, _stops, ("zbridge/control/latch.py",), 512)
     yield Target("claim", read_claim, _claims, ())
     yield Target("process", read_process, _processes, ())
-    yield Target("key", read_key, _keys, ("zbridge/fleet/topics.py", "zbridge/ros2/tokens.py", "zbridge/ros2/qos.py",
+    yield Target("key", read_key, _keys, ("zbridge/fleet/topics.py", "zbridge/ros2/rmw_zenoh.py",
                                            "zbridge/protocol/address.py"), 512)  # fmt: skip
-    yield Target("keyed-sample", read_keyed, _samples, ("zbridge/protocol/samples.py", "zbridge/ros2/attachment.py"))
+    yield Target("keyed-sample", read_keyed, _samples, ("zbridge/protocol/samples.py", "zbridge/ros2/rmw_zenoh.py"))
     yield Target("cdr", read_cdr, _cdr, ("zbridge/ros2/types.py", "zbridge/views/ros2/cmd_vel.py"))
     yield Target("viewer", read_viewer, _viewer, ("zbridge/views/foxglove/requests.py",
                                                   "zbridge/views/foxglove/twist.py"))  # fmt: skip

@@ -27,9 +27,7 @@ from zbridge.ros2 import (
     ros_type,
     topic_key,
 )
-from zbridge.ros2.attachment import read_attachment
-from zbridge.ros2.qos import read_qos
-from zbridge.ros2.tokens import gid_of
+from zbridge.ros2.rmw_zenoh import gid_of, read_attachment, read_qos
 
 STRING = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 ADD = "RIHS01_e118de6bf5eeb66a2491b5bda11202e7b68f198d6f67922cf30364858239c81a"

@@ -18,13 +18,12 @@ from zbridge.fleet.messages import Drive, Switch
 from zbridge.protocol.plugin import Outcome, Protocol, Simulation
 from zbridge.protocol.session import Session
 from zbridge.simulation import check as kit
+from zbridge.simulation.check import check_plugin
 from zbridge.simulation.check_commands import check_commands, check_stop
 from zbridge.simulation.check_messages import check_messages
 from zbridge.simulation.check_motion import check_motion
-from zbridge.simulation.check_plugin import check_plugin
-from zbridge.simulation.check_report import Finding
 from zbridge.simulation.check_sessions import check_sessions
-from zbridge.simulation.check_stage import Recording, record
+from zbridge.simulation.check_stage import Finding, Recording, record
 
 TOY: Protocol = toy.PROTOCOL
 

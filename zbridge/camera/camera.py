@@ -13,12 +13,10 @@ import time
 from collections.abc import Callable
 
 from zbridge.bus import Bus
-from zbridge.camera import jpeg
 from zbridge.camera.demand import Demand
-from zbridge.camera.latest import Latest
-from zbridge.camera.mjpeg import MjpegReader, Part
+from zbridge.camera.mjpeg import MjpegReader, Part, jpeg_size
 from zbridge.camera.pace import Pace
-from zbridge.camera.relay import Relay
+from zbridge.camera.relay import Latest, Relay
 from zbridge.camera.settings import CameraPlan
 from zbridge.camera.upstream import fetch
 from zbridge.control.conditions import Conditions
@@ -149,7 +147,7 @@ class Camera:
         self._pace.dropped = 0
         if due is not None:
             part, stamp_ns = due
-            width, height = jpeg.size(part.jpeg) or (None, None)
+            width, height = jpeg_size(part.jpeg) or (None, None)
             image = Image(format="jpeg", data=part.jpeg, width=width, height=height, stamp_ns=stamp_ns)
             self._publisher.put(payloads.encode(image))
             self._published.value += 1

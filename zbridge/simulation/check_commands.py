@@ -14,8 +14,7 @@ from zbridge.fleet.messages import Drive, FleetMessage, Mode, Motor, Raw, Scan, 
 from zbridge.fleet.topics import Topic
 from zbridge.protocol.plugin import Protocol
 from zbridge.protocol.session import State
-from zbridge.simulation.check_report import Finding, raised
-from zbridge.simulation.check_stage import STEP_S, Recording, Rehearsal, robot_of
+from zbridge.simulation.check_stage import STEP_S, Finding, Recording, Rehearsal, raised, robot_of
 
 STOP_S = 0.5
 """Seconds for which the stop is repeated."""

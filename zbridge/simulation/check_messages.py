@@ -13,7 +13,7 @@ import numpy as np
 from zbridge.errors import EncodeError, ProtocolError, describe
 from zbridge.protocol.codec import Codec
 from zbridge.protocol.plugin import Protocol
-from zbridge.simulation.check_report import Finding, raised
+from zbridge.simulation.check_stage import Finding, raised
 from zbridge.wire import Whole
 from zbridge.wire.fields import CountedArray, Filling
 from zbridge.wire.frames import FrameBuffer, FramingFault

@@ -13,8 +13,7 @@ from zbridge.errors import Refused
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, Mode, Motion, Pose
 from zbridge.protocol.plugin import Protocol
-from zbridge.simulation.check_report import Finding
-from zbridge.simulation.check_stage import Live, live
+from zbridge.simulation.check_stage import Finding, Live, live
 
 DRIVE_S = 1.0
 AGAIN_S = 0.1

@@ -9,8 +9,7 @@ from zbridge.errors import ProtocolError
 from zbridge.fleet import payload as payloads
 from zbridge.protocol.plugin import Protocol
 from zbridge.protocol.session import State
-from zbridge.simulation.check_report import Finding, raised
-from zbridge.simulation.check_stage import Recording, Rehearsal, robot_of
+from zbridge.simulation.check_stage import Finding, Recording, Rehearsal, raised, robot_of
 
 STEPS = 12
 """Steps of a long handshake at which something goes wrong."""

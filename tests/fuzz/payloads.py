@@ -26,10 +26,10 @@ from zbridge.ros2.rmw_zenoh import read_token
 from zbridge.views.foxglove import requests
 from zbridge.views.foxglove.twist import Scale
 from zbridge.views.foxglove.twist import read_twist as read_json_twist
-from zbridge.views.recording.stamps import with_stamp
 from zbridge.views.ros2.cmd_vel import STAMPED, TWIST
 from zbridge.views.ros2.cmd_vel import read_twist as read_cdr_twist
 from zbridge.views.ros2.settings import Body
+from zbridge.views.stamps import with_stamp
 
 KINDS = sorted(
     (kind for kind in vars(messages).values() if isinstance(kind, type) and issubclass(kind, FleetMessage)),
@@ -171,7 +171,7 @@ def require_drivable(drive: messages.Drive) -> None:
 
 def targets() -> Iterator[Target]:
     """Yield the targets."""
-    yield Target("fleet-payload", read_fleet, _fleet, ("zbridge/fleet/payload.py", "zbridge/views/recording/stamps.py"))
+    yield Target("fleet-payload", read_fleet, _fleet, ("zbridge/fleet/payload.py", "zbridge/views/stamps.py"))
     yield Target("authorization", read_authorization, _authorizations, (), 256)
     yield Target("stop", read_stops, _stops, ("zbridge/control/latch.py",), 512)
     yield Target("claim", read_claim, _claims, ())

@@ -2,11 +2,11 @@
 unlatch, restart, certs, record, info, export, mark, replay, ros2``.
 
 Knows no protocol. Only this package imports typer and rich, and this module does not: ``zbridge run`` loads neither.
-``app`` declares the commands, ``certs``, ``robots`` and ``recordings`` do for groups of them; ``bus``,
-``demo`` (with ``secure_demo`` and ``processes``), ``drive``, ``foxglove``, ``health``, ``probe``, ``recorded``,
-``replayed``, ``restart``, ``ros2``, ``router``, ``stops`` and ``supervise`` carry theirs out, ``keyboard`` turns keys
-into drives, ``fork_server`` is the process that gateways of ``zbridge run DIR`` are forked from. Exit codes: 0 done, 1
-failed, 2 wrong arguments or configuration; those of ``health`` are for monitoring programs.
+``app`` declares the commands; ``certs``, ``robot_commands`` and ``recording_commands`` declare groups of them. ``bus``,
+``demo`` (with ``demo_bus``), ``drive``, ``gateway_commands``, ``probe``, ``recording``, ``router``, ``supervise`` and
+``viewers`` carry them out. ``keyboard`` turns keys into drives, ``fork_server`` is the process that gateways of
+``zbridge run DIR`` are forked from. Exit codes: 0 done, 1 failed, 2 wrong arguments or configuration; those of
+``health`` are for monitoring programs.
 """
 
 from __future__ import annotations

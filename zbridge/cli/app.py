@@ -15,7 +15,17 @@ from zbridge.app.host import HostSettings, load_host, robot_files
 from zbridge.app.member import check_member, not_checked
 from zbridge.app.tasks import together
 from zbridge.bus.tls.files import ends_soon, out_of_date, utc_now
-from zbridge.cli import certs, give_up, hand_on_tls, recordings, robots, run_gateway, run_loop, run_together, set_up_log
+from zbridge.cli import (
+    certs,
+    give_up,
+    hand_on_tls,
+    recording_commands,
+    robot_commands,
+    run_gateway,
+    run_loop,
+    run_together,
+    set_up_log,
+)
 from zbridge.cli.options import Connect, FileTls, Realm, TlsFolder, check_name
 from zbridge.client import bus_settings
 from zbridge.errors import ConfigError
@@ -32,8 +42,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.add_typer(certs.app, name="certs")
-app.add_typer(robots.app)
-app.add_typer(recordings.app)
+app.add_typer(robot_commands.app)
+app.add_typer(recording_commands.app)
 
 File = Annotated[Path, typer.Argument(help="a gateway's configuration (TOML)", show_default=False)]
 Files = Annotated[

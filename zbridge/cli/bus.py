@@ -1,4 +1,4 @@
-"""``zbridge ls, echo``: the commands that read the bus."""
+"""``zbridge ls, health, echo``: the commands that read the bus."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from rich.text import Text
 from zbridge.bus import Bus, BusSettings, Sample, open_bus, read_key_expr
 from zbridge.bus.tls.refusal import why_not
 from zbridge.client import connect
-from zbridge.errors import ConfigError, PayloadError
+from zbridge.client.health import Health, Level, health
+from zbridge.errors import BusError, ConfigError, PayloadError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import FleetMessage, SessionEntry, Status
@@ -251,3 +252,42 @@ def _plain(value: Any, depth: int = _DEPTH) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value if value is None or isinstance(value, str | int) else str(value)
+
+
+_NAMED_ILL = 5
+"""Robots that the line names."""
+_REASON = 120
+"""Characters of a reason that the line shows."""
+
+
+async def report_health(settings: BusSettings, realm: str, robot: str | None, *, as_json: bool) -> int:
+    """Print how one robot is, or all of them; return the exit code: 0 ok, 1 warning, 2 critical."""
+    try:
+        async with connect(settings=settings, realm=realm) as fleet:
+            robots = await health(fleet, robot)
+        trouble = None if robots else f"no robots on {realm}/"
+    except BusError as error:
+        robots, trouble = {}, f"no bus: {error}"
+    level = Level.CRITICAL if trouble is not None else max(each.level for each in robots.values())
+    line = f"{level.name} - {trouble or _health_line(robots)}"
+    if as_json:
+        fields = {
+            name: {**msgspec.to_builtins(each), "level": each.level.name.lower()} for name, each in robots.items()
+        }
+        console.print(to_json({"level": level.name.lower(), "text": line, "robots": fields}))
+    else:
+        console.print(line)
+    return int(level)
+
+
+def _health_line(robots: dict[str, Health]) -> str:
+    """Count the robots that are well, and name the worst of the others with their reasons."""
+    ill = sorted((name for name, each in robots.items() if each.level), key=lambda name: -robots[name].level)
+    parts = [f"{len(robots) - len(ill)} of {len(robots)} robots established"]
+    parts += [f"{name} {_trouble(robots[name])}" for name in ill[:_NAMED_ILL]]
+    parts += [f"and {len(ill) - _NAMED_ILL} more"] * (len(ill) > _NAMED_ILL)
+    return "; ".join(parts)
+
+
+def _trouble(each: Health) -> str:
+    return shown(": ".join(filter(None, (each.state or "is missing", each.reason))), _REASON)

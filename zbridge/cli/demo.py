@@ -1,6 +1,6 @@
 """``zbridge demo``: a simulated robot of each protocol, their gateways, a router, a table. Loopback only.
 
-Here the bus is open to all of this machine, and its router embedded; ``secure_demo`` makes one with roles.
+Here the bus is open to all of this machine, and its router embedded; ``demo_bus`` makes one with roles.
 """
 
 from __future__ import annotations
@@ -26,8 +26,7 @@ from rich.table import Table
 from zbridge.app import until_signal
 from zbridge.bus import BusSettings, Sample, open_bus
 from zbridge.cli.bus import cell
-from zbridge.cli.processes import end, free_port, process
-from zbridge.cli.secure_demo import REALM, START_S, DemoBus, secure_bus
+from zbridge.cli.demo_bus import REALM, START_S, DemoBus, end, free_port, process, secure_bus
 from zbridge.client import LOCAL_ROUTER, Fleet, Robot
 from zbridge.errors import BusError, ConfigError, LeaseLost, NeutralFirst, NotReady, PayloadError, Refused, ZbridgeError
 from zbridge.fleet import payload as payloads

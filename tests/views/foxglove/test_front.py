@@ -22,10 +22,11 @@ from zbridge.errors import ConfigError
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.views.foxglove.admission import Policy
-from zbridge.views.foxglove.front import MESSAGE_BYTES, Front, tls_context
 from zbridge.views.foxglove.hub import Hub
+from zbridge.views.foxglove.server import MESSAGE_BYTES, Front, tls_context
 from zbridge.views.foxglove.source import Source
-from zbridge.views.pictures import Channel, Schema
+from zbridge.views.pictures import Channel
+from zbridge.views.schemas import Schema
 
 HOST = "127.0.0.1"
 FOXGLOVE = Origin("https://app.foxglove.dev")

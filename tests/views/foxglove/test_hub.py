@@ -4,7 +4,8 @@ import json
 from typing import Any
 
 from zbridge.views.foxglove.hub import Hub
-from zbridge.views.pictures import Channel, Schema
+from zbridge.views.pictures import Channel
+from zbridge.views.schemas import Schema
 
 SCHEMA = Schema("x", "jsonschema", b"{}", "json")
 SCAN = Channel("/r1/scan", "scan", SCHEMA)

@@ -13,7 +13,8 @@ from zbridge.views.foxglove.hub import Hub
 from zbridge.views.foxglove.playback import LATE_S, RECENT_S, Playback
 from zbridge.views.foxglove.recording import Message
 from zbridge.views.foxglove.requests import PlaybackRequest
-from zbridge.views.pictures import Channel, Schema
+from zbridge.views.pictures import Channel
+from zbridge.views.schemas import Schema
 
 pytestmark = pytest.mark.jumping
 

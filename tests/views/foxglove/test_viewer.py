@@ -16,7 +16,8 @@ from zbridge.views.foxglove.replies import Service
 from zbridge.views.foxglove.requests import ClientChannel, PlaybackRequest
 from zbridge.views.foxglove.source import Person, Source
 from zbridge.views.foxglove.viewer import CALLS, PUBLISHED, RATE_HZ, SEND_S, SUBSCRIPTIONS, TOLD_HZ, Overrun, Viewer
-from zbridge.views.pictures import Channel, Schema
+from zbridge.views.pictures import Channel
+from zbridge.views.schemas import Schema
 
 pytestmark = pytest.mark.jumping
 

@@ -9,7 +9,8 @@ from zbridge.errors import ProtocolError
 from zbridge.views.foxglove import replies, requests
 from zbridge.views.foxglove.replies import Level, PlaybackStatus, Service
 from zbridge.views.foxglove.requests import PlaybackRequest, Published, ServiceCall
-from zbridge.views.pictures import Channel, Schema, foxglove_schema
+from zbridge.views.pictures import Channel
+from zbridge.views.schemas import Schema, foxglove_schema
 
 POSE = Channel("/r1/pose", "pose", foxglove_schema("PoseInFrame"))
 JSON = Channel("/r1/x", "x", Schema("x", "jsonschema", b'{"type":"object"}', "json"))

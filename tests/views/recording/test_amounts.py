@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 import pytest
 
 from zbridge.errors import ConfigError
-from zbridge.views.recording import amounts
+from zbridge.views.recording import selection as amounts
 
 SPLITS = {
     "1GB": (10**9, None),

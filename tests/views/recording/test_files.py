@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from tests.views.recording import files
-from zbridge.views.recording import files as written
-from zbridge.views.recording.channels import channel_of
-from zbridge.views.recording.files import CHUNK_S, Tape, TapeSettings
+from zbridge.views.recording import tape as written
+from zbridge.views.recording.contents import channel_of
 from zbridge.views.recording.reader import Reader
+from zbridge.views.recording.tape import CHUNK_S, Tape, TapeSettings
 
 KEY = "fleet/r1/scan"
 NOISE = [os.urandom(200_000) for _ in range(10)]

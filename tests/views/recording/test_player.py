@@ -11,7 +11,7 @@ import pytest
 from tests.views.recording import files
 from zbridge.views.recording.player import Pace, Player
 from zbridge.views.recording.selection import Selection
-from zbridge.views.recording.stamps import with_stamp
+from zbridge.views.stamps import with_stamp
 
 S_NS = files.S_NS
 

@@ -25,7 +25,8 @@ from zbridge.views.foxglove.hub import Hub
 from zbridge.views.foxglove.replies import Service
 from zbridge.views.foxglove.requests import ClientChannel
 from zbridge.views.foxglove.source import Person, Source
-from zbridge.views.pictures import Channel, RobotPictures, Schema, channels_of, json_schema, sources_of
+from zbridge.views.pictures import Channel, RobotPictures, channels_of, sources_of
+from zbridge.views.schemas import Schema, json_schema
 
 ROBOTS = 256
 """Most robots that are shown at a time."""

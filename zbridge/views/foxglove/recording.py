@@ -14,7 +14,8 @@ import msgspec
 from mcap.reader import McapReader, NonSeekingReader, SeekingReader
 
 from zbridge.errors import ZbridgeError, describe
-from zbridge.views.pictures import Channel, Schema
+from zbridge.views.pictures import Channel
+from zbridge.views.schemas import Schema
 
 log = logging.getLogger("zbridge.foxglove")
 

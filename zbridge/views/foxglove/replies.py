@@ -11,7 +11,8 @@ from typing import Any
 import msgspec
 
 from zbridge.views.foxglove.requests import ServiceCall
-from zbridge.views.pictures import Channel, Schema
+from zbridge.views.pictures import Channel
+from zbridge.views.schemas import Schema
 
 SUBPROTOCOL = "foxglove.sdk.v1"
 _S_NS = 1_000_000_000

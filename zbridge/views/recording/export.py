@@ -17,7 +17,7 @@ from zbridge.errors import ConfigError, PayloadError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import FleetMessage, Pose, Scan
 from zbridge.fleet.topics import split_key
-from zbridge.views.recording.channels import MSGPACK, OCTETS, message_of
+from zbridge.views.recording.contents import MSGPACK, OCTETS, message_of
 from zbridge.views.recording.reader import Message, Reader, open_recording
 from zbridge.views.recording.selection import Selection
 

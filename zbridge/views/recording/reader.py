@@ -18,6 +18,7 @@ import msgspec
 
 from zbridge.errors import ConfigError, ZbridgeError
 
+EXTRA = "needs the extra: pip install 'zbridge[foxglove]'"
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_BYTES = 64 * 2**20
 """Longest record that is read."""
@@ -266,10 +267,9 @@ def _library(name: str) -> Any:
     try:
         return import_module(name)
     except ImportError as error:
-        raise ConfigError(f"a compressed recording {_EXTRA}") from error
+        raise ConfigError(f"a compressed recording {EXTRA}") from error
 
 
-_EXTRA = "needs the extra: pip install 'zbridge[foxglove]'"
 _DECOMPRESS: dict[str, Callable[[bytes, int], bytes]] = {"": lambda packed, size: packed, "zstd": _zstd, "lz4": _lz4}
 
 

@@ -21,10 +21,9 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, Status
 from zbridge.fleet.topics import Delivery, Topic, split_key
-from zbridge.views.recording.channels import SENT, ChannelKind, Sent, channel_of, is_command, read_sender
-from zbridge.views.recording.files import CHANNELS, Tape
+from zbridge.views.recording.contents import SENT, ChannelKind, Pictures, Sent, channel_of, is_command, read_sender
 from zbridge.views.recording.intake import Arrival, Intake, Losses
-from zbridge.views.recording.pictures import Pictures
+from zbridge.views.recording.tape import CHANNELS, Tape
 
 log = logging.getLogger("zbridge.views.recording")
 

@@ -25,7 +25,7 @@ from zbridge.hq import Listener, ListenerPlan, RobotSubscription
 from zbridge.metrics import Metrics
 from zbridge.protocol.session_table import SessionTable
 from zbridge.robot.ownership import Claim, Ownership, Standing
-from zbridge.views.recording.channels import MSGPACK, is_wire
+from zbridge.views.recording.contents import MSGPACK, is_wire
 from zbridge.views.recording.player import Player
 from zbridge.views.recording.reader import Message, Reader, open_recording
 from zbridge.views.recording.replayed_robot import KEYS, PROTOCOL, ReplayedRobot

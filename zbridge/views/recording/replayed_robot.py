@@ -25,7 +25,7 @@ from zbridge.fleet.messages import Control, FleetMessage, Query, Refusal, Status
 from zbridge.fleet.topics import Delivery, KeySpace, Topic
 from zbridge.protocol.rate_limit import RateLimit
 from zbridge.views.recording.reader import Message
-from zbridge.views.recording.stamps import with_stamp
+from zbridge.views.stamps import with_stamp
 
 PROTOCOL = "replay"
 """What ``status`` shows in place of the robot's protocol."""

@@ -1,9 +1,47 @@
-"""A minimal URDF of a robot's configured size, so that RViz shows something. Sans-IO."""
+"""The names of the frames of a robot, after REP 105, and a minimal URDF of its configured size. Sans-IO."""
 
 from __future__ import annotations
 
-from zbridge.views.ros2.frames import Frames
+import msgspec
+
+from zbridge.ros2 import ros_name
 from zbridge.views.ros2.settings import Body
+
+
+class Frames(msgspec.Struct, frozen=True):
+    """The names of one robot's frames. prefix: the robot, as a part of a ROS name."""
+
+    prefix: str
+
+    @property
+    def map(self) -> str:
+        """The robot's map."""
+        return f"{self.prefix}/map"
+
+    @property
+    def odom(self) -> str:
+        """Where odometry counts from."""
+        return f"{self.prefix}/odom"
+
+    @property
+    def base(self) -> str:
+        """The robot, on the ground."""
+        return f"{self.prefix}/base_link"
+
+    @property
+    def camera(self) -> str:
+        """The camera."""
+        return f"{self.prefix}/camera"
+
+    @property
+    def laser(self) -> str:
+        """The scanner."""
+        return f"{self.prefix}/laser"
+
+    def sensor(self, name: str) -> str:
+        """Name the frame of a sensor."""
+        return f"{self.prefix}/{ros_name(name)}"
+
 
 _LASER_M = 0.05
 """Radius and height of what is drawn for a scanner."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Container, Iterator
 from typing import Any
 
@@ -24,13 +25,46 @@ from zbridge.fleet.messages import (
 )
 from zbridge.metrics import Metrics
 from zbridge.ros2 import KEEP_LAST_10, LATCHED, SENSOR_DATA, QoS, Types, ros_name
-from zbridge.views.ros2.description import urdf
+from zbridge.views.ros2.description import Frames, urdf
 from zbridge.views.ros2.diagnostics import Entry, entries_of
-from zbridge.views.ros2.frames import Frames
-from zbridge.views.ros2.reckoning import Reckoning
 from zbridge.views.ros2.settings import Body
-from zbridge.views.ros2.shapes import Shapes, speeds_of
-from zbridge.views.ros2.stamps import Stamps
+from zbridge.views.ros2.shapes import Shapes, Speeds, speeds_of
+from zbridge.views.stamps import Stamps
+
+LONGEST_S = 3.0
+"""Nothing is added up over a longer pause: nobody knows what happened."""
+SPREAD_PER_M = 4.0
+"""The variance of the result grows by so many times that of a pose with each metre or radian."""
+
+
+class Reckoning:
+    """Adds up from the first motion on. spread: how many times larger the variance is than that of a pose."""
+
+    def __init__(self) -> None:
+        self.pose = Pose(0.0, 0.0, 0.0)
+        self.spread = 1.0
+        self._at_ns: int | None = None
+
+    def __repr__(self) -> str:
+        return f"<Reckoning {self.pose.x:.2f} {self.pose.y:.2f} {self.pose.heading:.2f}>"
+
+    def add(self, speeds: Speeds, stamp_ns: int) -> Pose | None:
+        """Add a motion that was measured at ``stamp_ns``; None where it has no speed or no turn rate."""
+        if speeds.forward_mps is None or speeds.turn_radps is None:
+            return None
+        before, self._at_ns = self._at_ns, stamp_ns
+        passed_s = (stamp_ns - before) / 1e9 if before is not None else 0.0
+        if 0.0 < passed_s <= LONGEST_S:
+            way, turned = speeds.forward_mps * passed_s, speeds.turn_radps * passed_s
+            middle = self.pose.heading + turned / 2
+            self.pose = Pose(
+                self.pose.x + way * math.cos(middle),
+                self.pose.y + way * math.sin(middle),
+                math.remainder(self.pose.heading + turned, math.tau),
+            )
+            self.spread = min(self.spread + SPREAD_PER_M * (abs(way) + abs(turned)), 1e6)
+        return self.pose
+
 
 SENSORS = "sensor/*"
 """The readings of all sensors, as a path below a robot."""

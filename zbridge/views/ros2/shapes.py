@@ -16,8 +16,8 @@ import numpy as np
 
 from zbridge.fleet.messages import Battery, Image, Map, Motion, Pose, Reading, Scan, Scanner
 from zbridge.ros2 import Types
+from zbridge.views.ros2.description import Frames
 from zbridge.views.ros2.forms import Form, ScanForm
-from zbridge.views.ros2.frames import Frames
 
 POSITION_VARIANCE = 0.05**2
 """Of x and y of a pose, m2. No robot of ours tells how good its pose is: an estimate."""

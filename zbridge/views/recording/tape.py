@@ -20,8 +20,9 @@ from typing import Any, Literal
 import msgspec
 
 from zbridge.errors import ConfigError
-from zbridge.views.recording.channels import ChannelKind
+from zbridge.views.recording.contents import ChannelKind
 from zbridge.views.recording.intake import Losses
+from zbridge.views.recording.reader import EXTRA
 
 CHUNK_BYTES = 2**20
 """Bytes of a chunk, uncompressed, about."""
@@ -37,7 +38,6 @@ _END = struct.pack("<BQI", 0x0F, 4, 0) + struct.pack("<BQQQI", 0x02, 20, 0, 0, 0
 """End of the data, a footer without summary, the magic bytes."""
 
 Compression = Literal["zstd", "lz4", "none"]
-EXTRA = "needs the extra: pip install 'zbridge[foxglove]'"
 
 
 class TapeSettings(msgspec.Struct, frozen=True):

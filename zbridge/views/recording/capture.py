@@ -10,15 +10,17 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import time
 from collections.abc import Callable
 
 import msgspec
 
 from zbridge.bus import Bus, Handle, Lane, Look, Sample
-from zbridge.errors import BusError
+from zbridge.errors import BusError, ConfigError
 from zbridge.fleet import payload as payloads
-from zbridge.fleet.topics import split_key
-from zbridge.views.recording.channels import Alive
+from zbridge.fleet.messages import Text
+from zbridge.fleet.topics import LARGE_BYTES, Delivery, Topic, split_key
+from zbridge.views.recording.contents import Alive
 from zbridge.views.recording.intake import Intake
 
 SESSIONS_S = 10.0
@@ -136,3 +138,18 @@ class Recording:
             if wanted(answer.key):
                 self._intake.put(answer.key, answer.payload)
         return bool(answers)
+
+
+MARK = Topic("@mark", Text, Delivery.COMMAND, LARGE_BYTES)
+"""Delivered as a command is: a mark that waits for room is not dropped."""
+TEXT_BYTES = 4096
+
+
+async def publish_mark(bus: Bus, realm: str, text: str, who: str) -> None:
+    """Put a mark; raise ConfigError where the text is empty or too long, BusError where the bus takes nothing."""
+    if not text.strip() or len(text.encode()) > TEXT_BYTES:
+        raise ConfigError(f"TEXT: expected 1 to {TEXT_BYTES} bytes")
+    mark = Text(text=text, kind="chat", sender=who, stamp_ns=time.time_ns())
+    with contextlib.closing(bus.publisher(f"{realm}/{MARK.path}", MARK)) as publisher:
+        publisher.put(payloads.encode(mark))
+        await bus.flush()

@@ -18,8 +18,8 @@ from zbridge.control.refusal_news import RefusalNews
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, FleetMessage, Image, Map, Pose, Scan, Status, Text
 from zbridge.fleet.topics import Topic
-from zbridge.views.pictures import drawing
-from zbridge.views.pictures.schemas import Schema, foxglove_schema, json_schema
+from zbridge.views import foxglove_messages
+from zbridge.views.schemas import Schema, foxglove_schema, json_schema
 
 TRAIL_POINTS = 256
 """Most points of a trail."""
@@ -116,16 +116,16 @@ class RobotPictures:
         if (also := _DRAWN_ALSO.get(channel.path)) is not None:
             yield from also(self, message, stamp_ns)
         elif isinstance(message, Scan):
-            yield drawing.laser_scan(message, self._scan, stamp_ns)
+            yield foxglove_messages.laser_scan(message, self._scan, stamp_ns)
         elif isinstance(message, Pose):
             if _is_finite(message):
-                yield drawing.pose_in_frame(message, self._map, stamp_ns)
+                yield foxglove_messages.pose_in_frame(message, self._map, stamp_ns)
         elif isinstance(message, Map):
             if message.rows and message.columns:
-                yield drawing.grid(message, self._map, stamp_ns)
+                yield foxglove_messages.grid(message, self._map, stamp_ns)
         elif isinstance(message, Image):
             if message.data:
-                yield drawing.compressed_image(message.data, message.format, self._base, stamp_ns)
+                yield foxglove_messages.compressed_image(message.data, message.format, self._base, stamp_ns)
         else:
             yield _ENCODE(message)
 
@@ -134,10 +134,10 @@ class RobotPictures:
         scanner = (self._base, self._scan, None)
         if isinstance(message, Pose) and _is_finite(message):
             self._frames_told_ns = stamp_ns
-            yield drawing.transforms(((self._map, self._base, message), scanner), stamp_ns)
+            yield foxglove_messages.transforms(((self._map, self._base, message), scanner), stamp_ns)
         elif abs(stamp_ns - self._frames_told_ns) >= FRAMES_EVERY_NS:
             self._frames_told_ns = stamp_ns
-            yield drawing.transforms((scanner,), stamp_ns)
+            yield foxglove_messages.transforms((scanner,), stamp_ns)
 
     def _on_trail(self, message: FleetMessage, stamp_ns: int) -> Iterator[bytes]:
         if not isinstance(message, Pose) or not _is_finite(message):
@@ -148,21 +148,21 @@ class RobotPictures:
         self._trail.append(at)
         if abs(stamp_ns - self._trail_drawn_ns) >= TRAIL_EVERY_NS:
             self._trail_drawn_ns = stamp_ns
-            yield drawing.trail(self._trail, self._map, stamp_ns)
+            yield foxglove_messages.trail(self._trail, self._map, stamp_ns)
 
     def _logged(self, message: FleetMessage, stamp_ns: int) -> Iterator[bytes]:
         """Write texts, changes of the robot's state, and refusals that are new."""
         if isinstance(message, Text):
-            yield drawing.log(message.text, _LEVELS[message.kind], message.sender or self.robot, stamp_ns)
+            yield foxglove_messages.log(message.text, _LEVELS[message.kind], message.sender or self.robot, stamp_ns)
         elif isinstance(message, Status) and self._state != (message.state, message.reason):
             self._state = (message.state, message.reason)
             level = LogLevel.Info if message.state == "established" else LogLevel.Warning
             text = message.state + (f": {message.reason}" if message.reason else "")
-            yield drawing.log(text, level, self.robot, stamp_ns)
+            yield foxglove_messages.log(text, level, self.robot, stamp_ns)
         elif isinstance(message, Control):
             for refusal in self._news.take(message):
                 text = f"{refusal.command} of {refusal.who or 'somebody'} refused: {refusal.reason} ({refusal.count})"
-                yield drawing.log(text, LogLevel.Warning, self.robot, stamp_ns)
+                yield foxglove_messages.log(text, LogLevel.Warning, self.robot, stamp_ns)
 
 
 def _is_finite(pose: Pose) -> bool:

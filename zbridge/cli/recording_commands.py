@@ -1,4 +1,4 @@
-"""Declares ``zbridge record, info, export, mark, replay``; ``recorded`` and ``replayed`` carry them out."""
+"""Declares ``zbridge record, info, export, mark, replay``; ``recording`` carries them out."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def record(
     realm: Realm = "fleet",
 ) -> None:
     """Record robots, or all of them, until SIGTERM or SIGINT: every key, commands and refusals too."""
-    from zbridge.cli.recorded import RecordOptions, run_record
+    from zbridge.cli.recording import RecordOptions, run_record
 
     set_up_log(verbose=False, level=logging.WARNING)
     if sum(map(bool, (robots, everything, keys))) != 1:
@@ -72,7 +72,7 @@ def info(
     json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
 ) -> None:
     """Say what a recording holds: robots, keys, counts, rates, gaps, and whether it was cut off."""
-    from zbridge.cli.recorded import show_info
+    from zbridge.cli.recording import show_info
 
     show_info(file, as_json=json)
 
@@ -90,7 +90,7 @@ def export(
     until: Until = "",
 ) -> None:
     """Write a recording as tables or as numpy arrays."""
-    from zbridge.cli.recorded import run_export
+    from zbridge.cli.recording import run_export
 
     if csv == npz:
         give_up(2, "give either --csv or --npz")
@@ -106,7 +106,7 @@ def mark(
     realm: Realm = "fleet",
 ) -> None:
     """Write an event into all running recordings of the realm."""
-    from zbridge.cli.recorded import put_mark
+    from zbridge.cli.recording import put_mark
 
     set_up_log(verbose=False, level=logging.ERROR)
     run_loop(put_mark(bus_settings(connect, tls), realm, text, who or None))
@@ -142,7 +142,7 @@ def replay(
     realm: Realm = "fleet",
 ) -> None:
     """Replay a recording onto the bus under another name, or to a gateway as the legacy robot itself."""
-    from zbridge.cli import replayed
+    from zbridge.cli.recording import ReplayOptions, run_replay, run_wire
 
     set_up_log(verbose=False, level=logging.WARNING)
     if bool(as_robot) != bool(listen):
@@ -150,9 +150,9 @@ def replay(
     if as_robot:
         if hq or loop or pause or since or until:
             give_up(2, "--as-robot replays a recording once and whole: no --hq, --loop, --pause, --from, --to")
-        run_loop(replayed.run_wire(file, as_robot, listen or [], robot or [], speed, realm))
+        run_loop(run_wire(file, as_robot, listen or [], robot or [], speed, realm))
         return
-    options = replayed.ReplayOptions(
+    options = ReplayOptions(
         path=file,
         realm=realm,
         robots=tuple(robot or ()),
@@ -163,4 +163,4 @@ def replay(
         pause=pause,
         hq=tuple(hq or ()),
     )
-    run_loop(replayed.run_replay(bus_settings(connect, tls), options))
+    run_loop(run_replay(bus_settings(connect, tls), options))

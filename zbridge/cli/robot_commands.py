@@ -50,7 +50,7 @@ def foxglove(
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="log what is refused")] = False,
 ) -> None:
     """Serve robots live, or a recording, to Foxglove until SIGTERM or SIGINT."""
-    from zbridge.cli.foxglove import run_foxglove
+    from zbridge.cli.viewers import run_foxglove
 
     set_up_log(verbose=verbose)
     given: dict[str, object] = {
@@ -97,7 +97,7 @@ def health(
     json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
 ) -> None:
     """Print how the robots are, for monitoring: exit code 0 ok, 1 warning, 2 critical."""
-    from zbridge.cli.health import report_health
+    from zbridge.cli.bus import report_health
 
     set_up_log(verbose=False, level=logging.CRITICAL)
     if robot:
@@ -161,7 +161,7 @@ def stop(
     realm: Realm = "fleet",
 ) -> None:
     """Stop a robot, or all of them; open to everyone who can write the key."""
-    from zbridge.cli.stops import stop
+    from zbridge.cli.gateway_commands import stop
 
     set_up_log(verbose=False, level=logging.ERROR)
     _check_one_or_all(robot, everything=everything)
@@ -179,7 +179,7 @@ def unlatch(
     realm: Realm = "fleet",
 ) -> None:
     """Release the latched stops of a robot, or those of the whole fleet; robots move only when somebody drives."""
-    from zbridge.cli.stops import unlatch
+    from zbridge.cli.gateway_commands import unlatch
 
     set_up_log(verbose=False, level=logging.ERROR)
     _check_one_or_all(robot, everything=everything)
@@ -197,7 +197,7 @@ def restart(
     realm: Realm = "fleet",
 ) -> None:
     """Restart a robot's gateway, or all of them: robots and HQ programs stay connected; what moves is stopped."""
-    from zbridge.cli.restart import restart as ask
+    from zbridge.cli.gateway_commands import restart as ask
 
     set_up_log(verbose=False, level=logging.ERROR)
     _check_one_or_all(robot, everything=everything)
@@ -225,7 +225,7 @@ def ros2(
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="log what is refused")] = False,
 ) -> None:
     """Show robots to ROS 2 over its middleware rmw_zenoh, until SIGTERM or SIGINT; needs zbridge[ros2]."""
-    from zbridge.cli.ros2 import run_ros2
+    from zbridge.cli.viewers import run_ros2
 
     set_up_log(verbose=verbose)
     given: dict[str, object] = {

@@ -1,4 +1,4 @@
-"""What each key of the bus is in a recording: its topic, its encoding, its schema. Sans-IO.
+"""What a recording holds: the channels of keys and pictures, and the configuration of a gateway.
 
 The topic is the Zenoh key. A fleet message is recorded as it was, encoding ``msgpack``; its schema is a JSON Schema
 (``jsonschema``) made of its declaration, in which ``bin`` has ``contentEncoding: binary``. Raw legacy frames are
@@ -9,15 +9,23 @@ The topic is the Zenoh key. A fleet message is recorded as it was, encoding ``ms
 from __future__ import annotations
 
 import json
-from typing import Any
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from zbridge.errors import PayloadError
+from zbridge.app.toml import read_toml
+from zbridge.errors import ConfigError, PayloadError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Authorization, FleetMessage, Sessions, Text
-from zbridge.fleet.topics import split_key
+from zbridge.fleet.topics import Topic, split_key
+from zbridge.views.recording.reader import EXTRA
+
+if TYPE_CHECKING:
+    from zbridge.views.pictures import Channel, RobotPictures
 
 MSGPACK, OCTETS, JSON = "msgpack", "octet-stream", "json"
 JSONSCHEMA = "jsonschema"
@@ -120,4 +128,75 @@ def _binary(value: Any) -> Any:
         return {key: "binary" if item == "base64" else _binary(item) for key, item in value.items()}
     if isinstance(value, list):
         return [_binary(item) for item in value]
+    return value
+
+
+ROBOTS = 1024
+"""Robots that are drawn; those of others are recorded without pictures."""
+
+
+class Pictures:
+    """Draws what robots publish. Raises ConfigError where Foxglove's messages are not installed."""
+
+    def __init__(self) -> None:
+        try:
+            from zbridge.views.pictures import RobotPictures
+        except ImportError as error:
+            raise ConfigError(f"pictures {EXTRA}, or --only fleet") from error
+        self.undrawn = 0
+        """Messages that could not be read."""
+        self._make = RobotPictures
+        self._robots: dict[str, RobotPictures] = {}
+        self._kinds: dict[Channel, ChannelKind] = {}
+
+    def __repr__(self) -> str:
+        return f"<Pictures of {len(self._robots)} robots>"
+
+    def draw(self, key: str, topic: Topic, payload: bytes, now_ns: int) -> Iterator[tuple[ChannelKind, int, bytes]]:
+        """Yield the pictures of a message: channel, publish time, payload."""
+        split = split_key(key)
+        if split is None:
+            return
+        robot = self._robots.get(split[1])
+        if robot is None:
+            if len(self._robots) >= ROBOTS:
+                return
+            robot = self._robots[split[1]] = self._make(split[1])
+        try:
+            message = payloads.decode(topic.message, payload)
+        except PayloadError:
+            self.undrawn += 1
+            return
+        for picture in robot.draw(topic, message, now_ns):
+            yield self._kind(picture.channel), picture.stamp_ns, picture.payload
+
+    def _kind(self, channel: Channel) -> ChannelKind:
+        kind = self._kinds.get(channel)
+        if kind is None:
+            schema = Schema(channel.schema.name, channel.schema.encoding, channel.schema.data)
+            kind = self._kinds[channel] = ChannelKind(channel.topic, channel.schema.message_encoding, schema)
+        return kind
+
+
+_SECRET = re.compile(r"pass|secret|token|key|credential|private|auth", re.IGNORECASE)
+_IN_ADDRESS = re.compile(r"(?<=//)[^/@\s]*@")
+_IN_QUERY = re.compile(rf"(?<=[?&;])([^=&#\s]*(?:{_SECRET.pattern})[^=&#\s]*=)[^&;#\s]*", re.IGNORECASE)
+HIDDEN = "***"
+
+
+def describe_configuration(path: Path) -> dict[str, str]:
+    """Return the metadata of a configuration file; raise ConfigError. ``${VAR}`` is not replaced."""
+    return {"file": path.name, "configuration": json.dumps(without_secrets(read_toml(path)), default=str)}
+
+
+def without_secrets(value: Any, name: str = "") -> Any:
+    """Return a configuration without what may be secret: values of telling names, the ``tls`` table, logins."""
+    if name == "tls" or (_SECRET.search(name) and not isinstance(value, dict)):
+        return HIDDEN
+    if isinstance(value, dict):
+        return {str(key): without_secrets(item, str(key)) for key, item in value.items()}
+    if isinstance(value, list):
+        return [without_secrets(item) for item in value]
+    if isinstance(value, str):
+        return _IN_QUERY.sub(rf"\g<1>{HIDDEN}", _IN_ADDRESS.sub(f"{HIDDEN}@", value))
     return value

@@ -228,14 +228,15 @@ def ros2(
     from zbridge.cli.viewers import run_ros2
 
     set_up_log(verbose=verbose)
-    given: dict[str, object] = {
+    options: dict[str, object] = {
         "domain": domain,
-        "robots": robot,
-        "drive": drive,
+        "robots": tuple(robot) or None,
+        "drive": drive or None,
         "distro": distro or None,
-        "ros": ros,
+        "ros": tuple(ros) or None,
         "realm": realm or None,
     }
+    given = {name: value for name, value in options.items() if value is not None}
     run_ros2(bus_settings(connect, tls) if connect or tls else None, bus_settings(), file, given)
 
 

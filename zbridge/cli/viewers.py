@@ -6,6 +6,8 @@ import gc
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import msgspec
+
 from zbridge.app import until_signal
 from zbridge.app.toml import convert, read_toml
 from zbridge.bus import BusSettings
@@ -47,14 +49,14 @@ def run_foxglove(bus: BusSettings, realm: str, file: Path | None, given: dict[st
 def run_ros2(bus: BusSettings | None, default: BusSettings, file: Path | None, given: dict[str, object]) -> None:
     """Show robots until SIGTERM or SIGINT; raise ConfigError or BusError.
 
-    bus: as given by options, else the file's, else ``default``. given: fields of Options, as they were given.
+    bus: as given by options, else the file's, else ``default``. given: fields of Ros2Settings that win over the file's.
     """
     from zbridge.views.ros2 import server
-    from zbridge.views.ros2.settings import File, Options, plan
+    from zbridge.views.ros2.settings import Ros2Settings, plan
 
     try:
-        written = convert(read_toml(file), File) if file is not None else File()
-        planned = plan(Options(**given), written)  # type: ignore[arg-type]
+        written = convert(read_toml(file), Ros2Settings) if file is not None else Ros2Settings()
+        planned = plan(msgspec.structs.replace(written, **given))
     except ConfigError as error:
         named = file is not None and str(file) not in str(error)
         raise ConfigError(f"{file}: {error}" if named else str(error)) from error

@@ -81,10 +81,7 @@ def check_plugin(protocol: Protocol, name: str) -> Iterator[Finding]:
         ("a session can be shown", lambda: _shown(protocol)),
     )
     for claim, find in checks:
-        try:
-            yield Finding(claim, find())
-        except Exception as error:  # whatever the protocol's own code raises is a finding
-            yield Finding.broken(claim, error)
+        yield Finding.tried(claim, find)
 
 
 def _named(protocol: Protocol, name: str) -> str | None:

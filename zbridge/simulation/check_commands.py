@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
@@ -28,25 +29,18 @@ MORE_FRAMES = 20
 
 def check_stop(protocol: Protocol, recording: Recording) -> Iterator[Finding]:
     """Check that the stop is the next thing written, and that motion that waits is not sent after it."""
+    expected = "a stop that is put into the outbox"
     claim = "the stop goes before all that waits, and no motion after it"
-    try:
-        yield Finding.of(claim, _stop(protocol, recording))
-    except Exception as error:  # whatever the protocol's own code raises is a finding
-        yield Finding.broken(claim, error, "a stop that is put into the outbox")
+    yield Finding.tried(claim, lambda: _stop(protocol, recording), expected)
     claim = "a stop is repeated until its time is over"
-    try:
-        yield Finding(claim, _repeated(protocol, recording))
-    except Exception as error:
-        yield Finding.broken(claim, error, "a stop that is put into the outbox")
+    yield Finding.tried(claim, lambda: _repeated(protocol, recording), expected)
     claim = "a stop before the first connection is refused or ignored"
-    try:
+    yield Finding.tried(claim, lambda: _early(protocol), "nothing, or Refused")
+
+
+def _early(protocol: Protocol) -> None:
+    with contextlib.suppress(Refused):
         robot_of(protocol).stop(0.0, 0.0)
-    except Refused:
-        pass
-    except Exception as error:
-        yield Finding.broken(claim, error, "nothing, or Refused")
-        return
-    yield Finding(claim)
 
 
 def _stop(protocol: Protocol, recording: Recording) -> list[str]:
@@ -102,16 +96,19 @@ def check_commands(protocol: Protocol, recording: Recording) -> Iterator[Finding
     """Check that every fleet command has an effect or is refused; a question likewise."""
     for topic, commands in _commands(protocol):
         claim = f"{topic.path} is carried out or refused with a code"
-        try:
-            rehearsal = _established(protocol, recording)
-            results = [_carry_out(rehearsal, topic, command) for command in commands]
-        except Exception as error:  # whatever the protocol's own code raises is a finding
-            yield Finding.broken(claim, error, "an Outcome, or Refused")
-            continue
-        silent = None if any(results) else "accepted, but nothing is written, shown, refused or left out"
-        yield Finding(claim, silent, next(filter(None, results), ""))
+        obey = partial(_obeyed, protocol, recording, topic, commands, claim)
+        yield Finding.tried(claim, obey, "an Outcome, or Refused")
     yield _corners(protocol, recording)
     yield from (_question(protocol, recording, topic) for topic in (topics.MAP, topics.POSE))
+
+
+def _obeyed(
+    protocol: Protocol, recording: Recording, topic: Topic, commands: tuple[FleetMessage, ...], claim: str
+) -> Finding:
+    rehearsal = _established(protocol, recording)
+    results = [_carry_out(rehearsal, topic, command) for command in commands]
+    silent = None if any(results) else "accepted, but nothing is written, shown, refused or left out"
+    return Finding(claim, silent, next(filter(None, results), ""))
 
 
 def _corners(protocol: Protocol, recording: Recording) -> Finding:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from typing import Any
 
 import msgspec
@@ -43,6 +43,17 @@ class Finding(msgspec.Struct, frozen=True):
     def broken(cls, claim: str, error: BaseException, expected: str = "") -> Finding:
         """Make the finding of a claim whose check ended with an exception; ``expected``: what should have come."""
         return cls(claim, raised(error, expected))
+
+    @classmethod
+    def tried(cls, claim: str, find: Callable[[], str | list[str] | Finding | None], expected: str = "") -> Finding:
+        """Make the finding of a check that gives a problem, several, or none, or that ends with an exception."""
+        try:
+            found = find()
+        except Exception as error:  # whatever the protocol's own code raises is a finding
+            return cls.broken(claim, error, expected)
+        if isinstance(found, Finding):
+            return found
+        return cls.of(claim, found) if isinstance(found, list) else cls(claim, found)
 
     def __str__(self) -> str:
         note = f" ({self.note})" if self.note else ""

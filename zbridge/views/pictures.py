@@ -20,6 +20,7 @@ from zbridge.fleet.messages import Control, FleetMessage, Image, Map, Pose, Scan
 from zbridge.fleet.topics import Topic
 from zbridge.views import foxglove_messages
 from zbridge.views.schemas import Schema, foxglove_schema, json_schema
+from zbridge.views.stamps import measured_ns
 
 TRAIL_POINTS = 256
 """Most points of a trail."""
@@ -29,7 +30,7 @@ TRAIL_EVERY_NS = 200_000_000
 """A trail is drawn at most so often: 5 times a second."""
 FRAMES_EVERY_NS = 1_000_000_000
 """The scanner's frame is told so often where no pose tells it: once a second."""
-_LAST_NS = 2**32 * 1_000_000_000
+_END_NS = 2**32 * 1_000_000_000
 """A stamp from here on has no place in a Foxglove message."""
 _LEVELS = {"debug": LogLevel.Debug, "chat": LogLevel.Info, "request": LogLevel.Info}
 
@@ -84,7 +85,7 @@ class RobotPictures:
         self._map, self._base, self._scan = (f"{robot}/{frame}" for frame in ("map", "base", "scan"))
         self._channels: dict[str, tuple[Channel, ...]] = {}
         self._trail: deque[tuple[float, float]] = deque(maxlen=TRAIL_POINTS)
-        self._trail_drawn_ns = self._frames_told_ns = -_LAST_NS
+        self._trail_drawn_ns = self._frames_told_ns = -_END_NS
         self._state: tuple[str, str | None] | None = None
         self._news = RefusalNews(lambda _: True)
 
@@ -102,9 +103,7 @@ class RobotPictures:
             channels = channels_of(self.robot, topic.path)
             if len(self._channels) < _KNOWN:
                 self._channels[topic.path] = channels
-        stamp_ns = message.stamp_ns if isinstance(message.stamp_ns, int) else now_ns
-        if not 0 <= stamp_ns < _LAST_NS:
-            stamp_ns = now_ns
+        stamp_ns = measured_ns(message.stamp_ns, now_ns, _END_NS)
         return [
             Picture(channel, payload, stamp_ns)
             for channel in channels

@@ -1,4 +1,4 @@
-"""Stamps of fleet messages: which ones ROS can write, and a new one in a payload. Sans-IO."""
+"""Stamps of fleet messages: when a message was measured, and a new stamp in a payload. Sans-IO."""
 
 from __future__ import annotations
 
@@ -8,38 +8,17 @@ from msgspec import UnsetType
 
 from zbridge.errors import PayloadError
 from zbridge.fleet import payload as payloads
-from zbridge.metrics import Metrics
-
-AHEAD_NS = 1_000_000_000
-"""A stamp may be so far ahead of our clock: clocks of machines differ."""
-_LAST_NS = (2**31 - 1) * 1_000_000_000
-"""From here on ROS has no number for a second."""
-
-
-class Stamps:
-    """Reads the stamps of fleet messages. One from the far future or that ROS cannot write becomes now; counted."""
-
-    def __init__(self, metrics: Metrics) -> None:
-        self._clamped = metrics.count("ros2_stamps_clamped")
-
-    def __repr__(self) -> str:
-        return f"<Stamps {self._clamped.value} clamped>"
-
-    def read(self, stamp_ns: int | UnsetType, now_ns: int) -> int:
-        """Return Unix nanoseconds; ``now_ns`` where there is no stamp."""
-        if not isinstance(stamp_ns, int):
-            return now_ns
-        if stamp_ns < 0 or stamp_ns >= min(now_ns + AHEAD_NS, _LAST_NS):
-            self._clamped.value += 1
-            return now_ns
-        return stamp_ns
-
 
 _NAME = b"\xa8stamp_ns\xcf"
 """The field as our encoder writes it: the first of the map, its number in 8 bytes."""
 _AT = 1 + len(_NAME)
 _MAPS = range(0x80, 0x90)
 _LARGEST = 2**64 - 1
+
+
+def measured_ns(stamp_ns: int | UnsetType, now_ns: int, end_ns: int) -> int:
+    """Return the stamp, Unix nanoseconds; ``now_ns`` where there is none, or none from 0 to before ``end_ns``."""
+    return stamp_ns if isinstance(stamp_ns, int) and 0 <= stamp_ns < end_ns else now_ns
 
 
 def with_stamp(payload: bytes, stamp_ns: int) -> bytes:

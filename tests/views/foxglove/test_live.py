@@ -13,7 +13,7 @@ from zbridge.fleet.messages import Control, Device, Devices, FleetMessage, Latch
 from zbridge.fleet.payload import encode
 from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
-from zbridge.views.foxglove.commands import Commands
+from zbridge.views.foxglove.commands import RobotCommands
 from zbridge.views.foxglove.hub import Hub
 from zbridge.views.foxglove.live import Live
 from zbridge.views.foxglove.twist import Scales
@@ -29,7 +29,7 @@ class Scene:
         self.bus = self.robot.join("2")
         self.metrics = Metrics()
         self.hub = Hub()
-        commands = Commands(self.hub, Fleet(self.bus), Scales(), "foxglove")
+        commands = RobotCommands(self.hub, Fleet(self.bus), Scales(), "foxglove")
         self.live = Live(self.hub, self.bus, "fleet", frozenset(robots), commands, self.metrics)
         self.before = self.keys()
         self.live.start()

@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from zbridge.errors import BusError, Unsupported
-from zbridge.views.foxglove.hub import Hub
+from zbridge.views.foxglove.hub import Hub, Subscriber
 from zbridge.views.foxglove.replies import Service
 from zbridge.views.foxglove.requests import ClientChannel, PlaybackRequest
-from zbridge.views.foxglove.source import Person, Source
+from zbridge.views.foxglove.source import Source
 from zbridge.views.foxglove.viewer import CALLS, PUBLISHED, RATE_HZ, SEND_S, SUBSCRIPTIONS, TOLD_HZ, Overrun, Viewer
 from zbridge.views.pictures import Channel
 from zbridge.views.schemas import Schema
@@ -52,6 +52,7 @@ class PlayedSource(Source):
 
     def __init__(self, hub: Hub) -> None:
         super().__init__(hub)
+        self.commands = self  # type: ignore[assignment]
         self.done: list[tuple[Any, ...]] = []
         self.fails: Exception | None = None
         self.goes_on = asyncio.Event()
@@ -60,24 +61,24 @@ class PlayedSource(Source):
     def services(self) -> list[Service]:
         return [Service(1, "/stop", "zbridge/Stop", {}, {})]
 
-    def greet(self, viewer: Person) -> None:
+    def greet(self, viewer: Subscriber) -> None:
         viewer.say("hello")
 
-    def published(self, viewer: Person, channel: ClientChannel, payload: bytes) -> None:
+    def published(self, viewer: Subscriber, channel: ClientChannel, payload: bytes) -> None:
         self.done.append((channel.topic, payload))
         self._fail()
 
-    def unpublished(self, viewer: Person, channel: ClientChannel) -> None:
+    def unpublished(self, viewer: Subscriber, channel: ClientChannel) -> None:
         self.done.append(("unpublished", channel.topic))
 
-    def play(self, viewer: Person, request: PlaybackRequest) -> None:
+    def play(self, viewer: Subscriber, request: PlaybackRequest) -> None:
         self.done.append(("play", request.play))
         self._fail()
 
     def watch_parameters(self, watched: bool) -> None:
         self.done.append(("watch", watched))
 
-    async def call(self, viewer: Person, service_id: int, payload: bytes) -> bytes:
+    async def call(self, viewer: Subscriber, service_id: int, payload: bytes) -> bytes:
         await self.goes_on.wait()
         self.done.append((service_id, payload))
         self._fail()
@@ -86,11 +87,11 @@ class PlayedSource(Source):
     async def parameters(self, names: tuple[str, ...], *, ask: bool = True) -> Mapping[str, Any]:
         return dict.fromkeys(names, ask)
 
-    async def set_parameter(self, viewer: Person, name: str, value: Any) -> None:
+    async def set_parameter(self, viewer: Subscriber, name: str, value: Any) -> None:
         self.done.append((name, value))
         self._fail()
 
-    async def left(self, viewer: Person) -> None:
+    async def left(self, viewer: Subscriber) -> None:
         self.done.append(("left",))
         self._fail()
 

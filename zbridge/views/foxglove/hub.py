@@ -19,8 +19,14 @@ CHANNELS = 8192
 """Most channels at a time."""
 
 
-class Receiver(Protocol):
-    """A viewer, as the hub needs it."""
+class Subscriber(Protocol):
+    """A viewer, as hub and sources need it.
+
+    name: shown to others as the driver. may_drive: whether its commands may move robots and change them.
+    """
+
+    name: str
+    may_drive: bool
 
     def say(self, message: str | bytes) -> None:
         """Send an answer or news."""
@@ -31,6 +37,9 @@ class Receiver(Protocol):
     def ended(self, subscription: int) -> None:
         """Forget a subscription: its channel is withdrawn."""
 
+    def warn(self, text: str) -> None:
+        """Tell the person something."""
+
     def parameters_changed(self, values: Mapping[str, Any]) -> None:
         """Tell parameters, where the viewer watches them."""
 
@@ -40,7 +49,7 @@ class _Offer:
         self.id = channel_id
         self.channel = channel
         self.entry: msgspec.Raw = replies.channel_entry(channel_id, channel)
-        self.wanted_by: dict[Receiver, int] = {}
+        self.wanted_by: dict[Subscriber, int] = {}
         self.last: tuple[int, bytes] | None = None
 
 
@@ -53,8 +62,8 @@ class Hub:
 
     def __init__(self) -> None:
         self.on_wanted: Callable[[Channel, bool], None] = lambda channel, wanted: None
-        self.on_subscribed: Callable[[Channel, Receiver, int], None] = lambda channel, viewer, subscription: None
-        self.viewers: set[Receiver] = set()
+        self.on_subscribed: Callable[[Channel, Subscriber, int], None] = lambda channel, viewer, subscription: None
+        self.viewers: set[Subscriber] = set()
         self._offers: dict[int, _Offer] = {}
         self._by_topic: dict[str, _Offer] = {}
         self._news: dict[str, str] = {}
@@ -79,7 +88,7 @@ class Hub:
             self._offers[offer.id] = self._by_topic[channel.topic] = offer
             new.append(offer.entry)
         if new:
-            self._tell(replies.advertise(new))
+            self.say(replies.advertise(new))
         return left_out
 
     def withdraw(self, topics: Iterable[str]) -> None:
@@ -92,7 +101,7 @@ class Hub:
             if offer.wanted_by:
                 self.on_wanted(offer.channel, False)
         if gone:
-            self._tell(replies.unadvertise([offer.id for offer in gone]))
+            self.say(replies.unadvertise([offer.id for offer in gone]))
 
     def publish(self, topic: str, stamp_ns: int, payload: bytes) -> None:
         """Show a message to the viewers of a channel."""
@@ -106,7 +115,8 @@ class Hub:
 
     def say(self, message: str | bytes) -> None:
         """Tell all viewers."""
-        self._tell(message)
+        for viewer in self.viewers:
+            viewer.say(message)
 
     def warn(self, name: str, text: str | None) -> None:
         """Show all viewers, those who come later too, what holds until it is called anew with the same name."""
@@ -114,10 +124,10 @@ class Hub:
             return
         if text is None:
             del self._news[name]
-            self._tell(replies.remove_status([name]))
+            self.say(replies.remove_status([name]))
         else:
             self._news[name] = text
-            self._tell(replies.status(Level.WARNING, text, name))
+            self.say(replies.status(Level.WARNING, text, name))
 
     def parameters_changed(self, values: Mapping[str, Any]) -> None:
         """Tell the viewers that watch these parameters."""
@@ -130,7 +140,7 @@ class Hub:
 
     # The viewers' side
 
-    def join(self, viewer: Receiver) -> None:
+    def join(self, viewer: Subscriber) -> None:
         """Show a viewer the channels there are, and the warnings that hold."""
         self.viewers.add(viewer)
         if self._offers:
@@ -138,13 +148,13 @@ class Hub:
         for name, text in self._news.items():
             viewer.say(replies.status(Level.WARNING, text, name))
 
-    def leave(self, viewer: Receiver) -> None:
+    def leave(self, viewer: Subscriber) -> None:
         """End a viewer's subscriptions; idempotent."""
         self.viewers.discard(viewer)
         for offer in list(self._offers.values()):
             self._leave(viewer, offer)
 
-    def subscribe(self, viewer: Receiver, subscription: int, channel_id: int) -> bool:
+    def subscribe(self, viewer: Subscriber, subscription: int, channel_id: int) -> bool:
         """Subscribe a viewer to a channel it is not subscribed to; False for an unknown channel."""
         offer = self._offers.get(channel_id)
         if offer is None:
@@ -159,17 +169,13 @@ class Hub:
             self.on_subscribed(offer.channel, viewer, subscription)
         return True
 
-    def unsubscribe(self, viewer: Receiver, channel_id: int) -> None:
+    def unsubscribe(self, viewer: Subscriber, channel_id: int) -> None:
         """End one subscription of a viewer."""
         offer = self._offers.get(channel_id)
         if offer is not None:
             self._leave(viewer, offer)
 
-    def _leave(self, viewer: Receiver, offer: _Offer) -> None:
+    def _leave(self, viewer: Subscriber, offer: _Offer) -> None:
         if offer.wanted_by.pop(viewer, None) is not None and not offer.wanted_by:
             offer.last = None  # nothing renews it any more
             self.on_wanted(offer.channel, False)
-
-    def _tell(self, message: str | bytes) -> None:
-        for viewer in self.viewers:
-            viewer.say(message)

@@ -11,64 +11,15 @@ import asyncio
 import contextlib
 import itertools
 from collections.abc import Iterator
-from typing import cast
 
 from zbridge.views.foxglove import replies
-from zbridge.views.foxglove.hub import Hub, Receiver
+from zbridge.views.foxglove.hub import Hub, Subscriber
 from zbridge.views.foxglove.recording import Message, Recording
 from zbridge.views.foxglove.replies import PlaybackStatus
 from zbridge.views.foxglove.requests import PlaybackRequest
-from zbridge.views.foxglove.source import Person, Source
+from zbridge.views.foxglove.source import Source
 from zbridge.views.pictures import Channel
-
-
-class PlaybackClock:
-    """Rests at the begin until it is told to play. begin_ns, end_ns: the first and the last time of the recording."""
-
-    def __init__(self, begin_ns: int, end_ns: int) -> None:
-        self.begin_ns = begin_ns
-        self.end_ns = end_ns
-        self.playing = False
-        self.speed = 1.0
-        self._at_ns = begin_ns
-        self._since = 0.0
-
-    def __repr__(self) -> str:
-        return f"<PlaybackClock {'playing' if self.playing else 'paused'} at {self._at_ns} x {self.speed:g}>"
-
-    @property
-    def ended(self) -> bool:
-        """Whether it rests at the end."""
-        return not self.playing and self._at_ns >= self.end_ns
-
-    def now_ns(self, now: float) -> int:
-        """Return the time of the recording."""
-        if not self.playing:
-            return self._at_ns
-        return min(self.end_ns, self._at_ns + int((now - self._since) * self.speed * 1e9))
-
-    def play(self, speed: float, now: float) -> None:
-        """Run from here on, at so many times the recording's speed; from the begin where it has ended."""
-        at_ns = self.now_ns(now)
-        self._set(self.begin_ns if self.ended else at_ns, now)
-        self.playing, self.speed = True, speed
-
-    def pause(self, now: float) -> None:
-        """Rest here."""
-        self._set(self.now_ns(now), now)
-        self.playing = False
-
-    def seek(self, to_ns: int, now: float) -> None:
-        """Jump, within the recording."""
-        self._set(max(self.begin_ns, min(self.end_ns, to_ns)), now)
-
-    def wait_s(self, for_ns: int, now: float) -> float:
-        """Return the real time until a time of the recording; 0 or less if it is past."""
-        return (for_ns - self.now_ns(now)) / 1e9 / self.speed
-
-    def _set(self, at_ns: int, now: float) -> None:
-        self._at_ns, self._since = at_ns, now
-
+from zbridge.views.recording.player import PlaybackClock
 
 BATCH = 64
 """Messages that are read at once."""
@@ -106,12 +57,12 @@ class Playback(Source):
 
     # What viewers do
 
-    def greet(self, viewer: Person) -> None:
+    def greet(self, viewer: Subscriber) -> None:
         """Tell a new viewer what is being played."""
         viewer.say(self._state(sought=False, request_id=""))
         viewer.say(replies.time(self._now_ns()))
 
-    def play(self, viewer: Person, request: PlaybackRequest) -> None:
+    def play(self, viewer: Subscriber, request: PlaybackRequest) -> None:
         """Play or pause, from another time if one is named. The others are told without the id of the request."""
         now = self._loop.time()
         sought = request.seek_ns is not None or (request.play and self._clock.ended)
@@ -128,7 +79,7 @@ class Playback(Source):
         viewer.say(self._state(sought=sought, request_id=request.request_id))
         others = self._state(sought=sought, request_id="")
         for other in self.hub.viewers:
-            if other is not cast(Receiver, viewer):
+            if other is not viewer:
                 other.say(others)
         self._changed.set()
 
@@ -137,7 +88,7 @@ class Playback(Source):
             self._look_back.add(channel.topic)
             self._changed.set()
 
-    def _on_subscribed(self, channel: Channel, viewer: Receiver, subscription: int) -> None:
+    def _on_subscribed(self, channel: Channel, viewer: Subscriber, subscription: int) -> None:
         self._on_wanted(channel, True)
 
     # What is shown

@@ -28,7 +28,7 @@ from zbridge.fleet.printable import shown
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.views.foxglove.admission import Admission, Admitted, Policy, Request
-from zbridge.views.foxglove.commands import Commands
+from zbridge.views.foxglove.commands import RobotCommands
 from zbridge.views.foxglove.hub import Hub
 from zbridge.views.foxglove.live import Live
 from zbridge.views.foxglove.playback import Playback
@@ -244,7 +244,7 @@ async def serve_live(
 
 async def _serve_bus(plan: Plan, bus: Bus, realm: str, metrics: Metrics, on_ready: Callable[[Front], None]) -> None:
     hub = Hub()
-    commands = Commands(hub, Fleet(bus, realm), plan.scales, plan.policy.who)
+    commands = RobotCommands(hub, Fleet(bus, realm), plan.scales, plan.policy.who)
     live = Live(hub, bus, realm, plan.robots, commands, metrics)
     live.start()
     try:

@@ -89,7 +89,7 @@ class Viewer:
         """Serve the viewer until it is gone; raise Overrun or TimeoutError if it has to be ended."""
         self.say(self._source.info())
         self._hub.join(self)
-        services = self._source.services()
+        services = self._source.commands.services()
         if services:
             self.say(replies.advertise_services(services))
         self._source.greet(self)
@@ -184,7 +184,7 @@ class Viewer:
             case requests.Published(channel_id, payload):
                 if (channel := self._published.get(channel_id)) is None:
                     raise Unsupported(f"channel {channel_id} is not one of yours")
-                self._source.published(self, channel, payload)
+                self._source.commands.published(self, channel, payload)
             case ServiceCall() as call:
                 if not self._start(self._call(call)):
                     self.say(replies.service_failure(call, f"more than {CALLS} calls at the same time"))
@@ -223,7 +223,7 @@ class Viewer:
         for channel_id in said.channel_ids:
             channel = self._published.pop(channel_id, None)
             if channel is not None:
-                self._source.unpublished(self, channel)
+                self._source.commands.unpublished(self, channel)
 
     def _get(self, said: requests.GetParameters) -> None:
         self._start(self._tell_parameters(said.parameter_names, said.id))
@@ -265,7 +265,7 @@ class Viewer:
         try:
             if call.encoding != "json":
                 raise Unsupported(f"encoding {call.encoding[:16]!r}: expected 'json'")
-            payload = await self._source.call(self, call.service_id, call.payload)
+            payload = await self._source.commands.call(self, call.service_id, call.payload)
         except (Refused, BusError, ProtocolError) as error:
             self.counts["refused"] += 1
             self.say(replies.service_failure(call, shown(error)))
@@ -275,7 +275,7 @@ class Viewer:
     async def _set_parameters(self, said: requests.SetParameters) -> None:
         for parameter in said.parameters:
             try:
-                await self._source.set_parameter(self, parameter.name, parameter.value)
+                await self._source.commands.set_parameter(self, parameter.name, parameter.value)
             except (Refused, BusError, ProtocolError) as error:
                 self.refuse(error)
         if said.id is not None:
@@ -290,7 +290,7 @@ class Viewer:
         if self._watched is not None:
             self._source.watch_parameters(False)
         try:
-            await self._source.left(self)
+            await self._source.commands.left(self)
         except Exception as error:  # the others must go on
             log.error("%s left: %s", self.name, describe(error))
 

@@ -23,12 +23,12 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Authorization, FleetMessage, Sessions, Text
 from zbridge.fleet.topics import Topic, split_key
 from zbridge.views.recording.reader import EXTRA
+from zbridge.views.schemas import Schema
 
 if TYPE_CHECKING:
     from zbridge.views.pictures import Channel, RobotPictures
 
 MSGPACK, OCTETS, JSON = "msgpack", "octet-stream", "json"
-JSONSCHEMA = "jsonschema"
 SENT = "/@sent"
 """Ends the topic that stands beside a command's."""
 _TRANSPORT = "transport"
@@ -49,14 +49,6 @@ class Alive(FleetMessage, frozen=True):
     """A liveliness token came or went."""
 
     alive: bool
-
-
-class Schema(msgspec.Struct, frozen=True):
-    """The schema of a channel."""
-
-    name: str
-    encoding: str
-    data: bytes
 
 
 class ChannelKind(msgspec.Struct, frozen=True):
@@ -105,7 +97,7 @@ def channel_of(key: str, *, datagram: bool = False) -> ChannelKind:
 def schema_of(message: type[FleetMessage]) -> Schema:
     """Make the schema of a message of its declaration."""
     text = msgspec.json.schema(message, schema_hook=_unknown)
-    return Schema(payloads.schema(message), JSONSCHEMA, json.dumps(_binary(text), sort_keys=True).encode())
+    return Schema(payloads.schema(message), "jsonschema", json.dumps(_binary(text), sort_keys=True).encode(), MSGPACK)
 
 
 def read_sender(attachment: bytes | None) -> bytes | None:
@@ -173,8 +165,8 @@ class Pictures:
     def _kind(self, channel: Channel) -> ChannelKind:
         kind = self._kinds.get(channel)
         if kind is None:
-            schema = Schema(channel.schema.name, channel.schema.encoding, channel.schema.data)
-            kind = self._kinds[channel] = ChannelKind(channel.topic, channel.schema.message_encoding, schema)
+            schema = channel.schema
+            kind = self._kinds[channel] = ChannelKind(channel.topic, schema.message_encoding, schema)
         return kind
 
 

@@ -51,7 +51,7 @@ _read_stamp = msgspec.msgpack.Decoder(_Stamp).decode
 class _Track:
     """One key of the recording. channel: its id in the file of ``number``."""
 
-    __slots__ = ("channel", "count", "kind", "number", "pictured", "seen", "seq", "topic")
+    __slots__ = ("channel", "count", "kind", "number", "seq", "topic")
 
     def __init__(self, kind: ChannelKind, topic: Topic | None) -> None:
         self.kind = kind

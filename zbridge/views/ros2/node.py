@@ -11,12 +11,11 @@ from typing import Any
 
 from zbridge.bus import Bus, Handle, Sample
 from zbridge.client import Fleet
-from zbridge.errors import PayloadError
-from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Devices
+from zbridge.fleet.messages import Devices, FleetMessage
 from zbridge.fleet.topics import KeySpace, Topic, is_concrete
 from zbridge.ros2 import Kind
+from zbridge.views.live_robots import OnDemand, read_payload
 from zbridge.views.ros2.holder import NAME
 from zbridge.views.ros2.outlets import Outlet, RosSide
 from zbridge.views.ros2.pictures import TOPICS, RobotPictures, RosTopic
@@ -53,7 +52,7 @@ class RobotNode:
         self._outlets: dict[str, list[Outlet]] = {}
         self._listened: dict[str, set[Outlet]] = {}
         """The outlets of each topic that somebody listens to; topics without one are left out."""
-        self._subscribed: dict[str, Handle] = {}
+        self._subscribed = OnDemand(self._subscribe_to)
         self._paths: dict[str, tuple[str, ...]] = {}
         self._timer: asyncio.TimerHandle | None = None
         self._closed = False
@@ -76,8 +75,9 @@ class RobotNode:
         if self._timer is not None:
             self._timer.cancel()
         outlets = [outlet for of_topic in self._outlets.values() for outlet in of_topic]
-        for handle in (*self._handles, *self._subscribed.values(), *outlets):
+        for handle in (*self._handles, *outlets):
             handle.close()
+        self._subscribed.need(set())
         self._services.close()
         if self.teleop is not None:
             await self.teleop.close()
@@ -117,14 +117,13 @@ class RobotNode:
     def _subscribe(self) -> None:
         """Subscribe on the fleet's bus to what the topics that are listened to need, and to nothing else."""
         needed = {path for name in self._listened for path in self._paths[name]}
-        for path in self._subscribed.keys() - needed:
-            self._subscribed.pop(path).close()
-        for path in needed - self._subscribed.keys():
-            topic = topics.find(path) if is_concrete(path) else None
-            handler = partial(self._take, path, topic) if topic is not None else self._take_any
-            history = topic is not None and topic.qos.keeps_last
-            key = self._keys.key(path)
-            self._subscribed[path] = self._bus.subscribe(key, handler, history=history, direct=not history)
+        self._subscribed.need(needed)
+
+    def _subscribe_to(self, path: str) -> Handle:
+        topic = topics.find(path) if is_concrete(path) else None
+        handler = partial(self._take, path, topic) if topic is not None else self._take_any
+        history = topic is not None and topic.qos.keeps_last
+        return self._bus.subscribe(self._keys.key(path), handler, history=history, direct=not history)
 
     def _take_any(self, sample: Sample) -> None:
         path = self._keys.path(sample.key)
@@ -133,10 +132,10 @@ class RobotNode:
             self._take(path, topic, sample)
 
     def _take(self, path: str, topic: Topic, sample: Sample) -> None:
-        try:
-            message = payloads.decode(topic.message, sample.payload, arrays=topic is not topics.SCAN)
-        except PayloadError:
-            self._malformed.value += 1
+        message: FleetMessage | None = read_payload(
+            topic.message, sample.payload, self._malformed, arrays=topic is not topics.SCAN
+        )
+        if message is None:
             return
         with self._lock:
             listened = self._listened
@@ -150,12 +149,8 @@ class RobotNode:
             outlet.put(message)
 
     def _on_devices(self, sample: Sample) -> None:
-        try:
-            devices = payloads.decode(Devices, sample.payload)
-        except PayloadError:
-            self._malformed.value += 1
-            return
-        if self._closed:
+        devices = read_payload(Devices, sample.payload, self._malformed)
+        if devices is None or self._closed:
             return
         with self._lock:
             sensors = self._pictures.sensors(devices.devices)

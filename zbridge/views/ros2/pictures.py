@@ -29,7 +29,7 @@ from zbridge.views.ros2.description import Frames, urdf
 from zbridge.views.ros2.diagnostics import Entry, entries_of
 from zbridge.views.ros2.settings import Body
 from zbridge.views.ros2.shapes import Shapes, Speeds, speeds_of
-from zbridge.views.stamps import Stamps
+from zbridge.views.stamps import measured_ns
 
 LONGEST_S = 3.0
 """Nothing is added up over a longer pause: nobody knows what happened."""
@@ -70,6 +70,10 @@ SENSORS = "sensor/*"
 """The readings of all sensors, as a path below a robot."""
 MOST_SENSORS = 64
 """Sensors of one robot that have a topic."""
+AHEAD_NS = 1_000_000_000
+"""A stamp may be so far ahead of our clock: clocks of machines differ. A later one becomes now, counted."""
+_END_NS = (2**31 - 1) * 1_000_000_000
+"""From here on ROS has no number for a second."""
 _LONGEST_PERIOD_S = 10.0
 _KINDS = {"distance": "range", "rotational": "joint", "linear": "joint"}
 
@@ -127,7 +131,7 @@ class RobotPictures:
         self._types = types
         self._body = body
         self._shapes = Shapes(types, self.frames)
-        self._stamps = Stamps(metrics)
+        self._clamped = metrics.count("ros2_stamps_clamped")
         self._unusable = metrics.count("ros2_unusable")
         self._motion: Motion | None = None
         self._has_pose = False
@@ -173,7 +177,8 @@ class RobotPictures:
         maker = _MAKERS.get(type(message))
         if maker is None:
             return
-        stamp_ns = self._stamps.read(message.stamp_ns, now_ns)
+        stamp_ns = measured_ns(message.stamp_ns, now_ns, min(now_ns + AHEAD_NS, _END_NS))
+        self._clamped.value += isinstance(message.stamp_ns, int) and message.stamp_ns != stamp_ns
         for name, made in maker(self, path, message, stamp_ns, wanted):
             if made is not None:
                 yield name, made
@@ -206,10 +211,6 @@ class RobotPictures:
         period_s = period_s if 0.0 < period_s < _LONGEST_PERIOD_S else 0.0
         if "scan" in wanted:
             yield "scan", self._shapes.laser_scan(scan, self._scanner, stamp_ns, period_s)
-
-    def _on_scanner(self, path: str, scanner: Scanner, stamp_ns: int, wanted: Container[str]) -> Made:
-        self._scanner = scanner
-        yield from ()
 
     def _on_pose(self, path: str, pose: Pose, stamp_ns: int, wanted: Container[str]) -> Made:
         self._has_pose = True
@@ -258,24 +259,25 @@ class RobotPictures:
             self._positions[name] = reading.value
             yield JOINTS.name, self._shapes.joint_states(self._positions, stamp_ns)
 
-    def _on_status(self, path: str, status: Status, stamp_ns: int, wanted: Container[str]) -> Made:
-        self._status = status
-        yield from ()
-
-    def _on_control(self, path: str, control: Control, stamp_ns: int, wanted: Container[str]) -> Made:
-        self._control = control
-        yield from ()
+    def _on_state(self, path: str, state: Scanner | Status | Control, stamp_ns: int, wanted: Container[str]) -> Made:
+        if isinstance(state, Scanner):
+            self._scanner = state
+        elif isinstance(state, Status):
+            self._status = state
+        else:
+            self._control = state
+        return iter(())
 
 
 _MAKERS: dict[type[FleetMessage], Callable[[RobotPictures, str, Any, int, Container[str]], Made]] = {
     Scan: RobotPictures._on_scan,
-    Scanner: RobotPictures._on_scanner,
+    Scanner: RobotPictures._on_state,
     Pose: RobotPictures._on_pose,
     Motion: RobotPictures._on_motion,
     Map: RobotPictures._on_map,
     Battery: RobotPictures._on_battery,
     Image: RobotPictures._on_image,
     Reading: RobotPictures._on_reading,
-    Status: RobotPictures._on_status,
-    Control: RobotPictures._on_control,
+    Status: RobotPictures._on_state,
+    Control: RobotPictures._on_state,
 }

@@ -10,17 +10,16 @@ from collections.abc import Callable
 from zbridge.bus import Bus, BusSettings, open_bus
 from zbridge.bus.tls.member import own_name
 from zbridge.errors import BusError, ConfigError
-from zbridge.fleet.topics import KeySpace, is_name, split_key
+from zbridge.fleet.topics import KeySpace
 from zbridge.metrics import Metrics
 from zbridge.ros2 import ros_name, types_of
+from zbridge.views.live_robots import ROBOTS, watch_robots
 from zbridge.views.ros2.node import RobotNode
 from zbridge.views.ros2.outlets import RosSide
 from zbridge.views.ros2.settings import Plan
 
 log = logging.getLogger("zbridge.ros2")
 
-ROBOTS = 256
-"""Most robots that are shown at a time."""
 HIDDEN_AFTER_S = 2.0
 """A robot whose gateway is away for less keeps its node."""
 
@@ -78,7 +77,7 @@ class View:
 
     def start(self) -> None:
         """Begin to look for robots."""
-        self._fleet.watch_alive(f"{self._plan.realm}/*/@alive/gateway", self._on_gateway)
+        watch_robots(self._fleet, self._plan.realm, self._plan.robots, self._on_gateway)
         self._side.bus.watch_connected(self._on_connected)
 
     async def close(self) -> None:
@@ -95,10 +94,7 @@ class View:
             if node.teleop is not None:
                 node.teleop.connected(up)
 
-    def _on_gateway(self, key: str, alive: bool) -> None:
-        split = split_key(key)
-        if split is None or not is_name(robot := split[1]) or (self._plan.robots and robot not in self._plan.robots):
-            return
+    def _on_gateway(self, robot: str, alive: bool) -> None:
         timer = self._leaving.pop(robot, None)
         if timer is not None:
             timer.cancel()

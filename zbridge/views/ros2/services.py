@@ -48,8 +48,10 @@ class Services:
     def close(self) -> None:
         """Take the services back; idempotent. Calls that are on their way end unanswered."""
         handles, self._handles = self._handles, []
-        for closed in (*handles, *(_Cancelled(task) for task in self._tasks)):
-            closed.close()
+        for handle in handles:
+            handle.close()
+        for task in self._tasks:
+            task.cancel()
 
     def _switches(self) -> Mapping[str, Callable[[bool], Awaitable[None]]]:
         robot = self._robot
@@ -111,16 +113,6 @@ class Services:
 
     async def _unlatch(self, request: Any) -> None:
         await self._robot.unlatch()
-
-
-class _Cancelled:
-    """A call that ends when the services do."""
-
-    def __init__(self, task: asyncio.Task[None]) -> None:
-        self._task = task
-
-    def close(self) -> None:
-        self._task.cancel()
 
 
 async def _switched(switch: Callable[[bool], Awaitable[None]], request: Any) -> None:

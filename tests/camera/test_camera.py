@@ -14,8 +14,8 @@ from zbridge.camera import CameraSettings, plan_camera
 from zbridge.camera import camera as cameras
 from zbridge.camera.camera import RETRY_S, Camera
 from zbridge.camera.demand import LINGER_S
-from zbridge.camera.mjpeg import MjpegReader, Part
-from zbridge.camera.settings import Source
+from zbridge.camera.mjpeg import MjpegPart, MjpegReader
+from zbridge.camera.settings import CameraSource
 from zbridge.camera.upstream import Took
 from zbridge.control.conditions import Conditions
 from zbridge.errors import LinkError
@@ -46,8 +46,8 @@ class Scene:
         self.camera = Camera(plan, KeySpace("fleet", "r1"), self.bus, self.metrics, self.conditions, lambda: STAMP_NS)
         self._watched = False
 
-    async def _fetch(self, source: Source, stall_s: float, took: Took) -> None:
-        assert (source, stall_s) == (Source("robot", 80, "/s"), 3.0)
+    async def _fetch(self, source: CameraSource, stall_s: float, took: Took) -> None:
+        assert (source, stall_s) == (CameraSource("robot", 80, "/s"), 3.0)
         self.took, self.end = took, self.loop.create_future()
         self.begun.append(self.loop.time())
         self.fetching += 1
@@ -63,7 +63,7 @@ class Scene:
     def read(self, *pictures: bytes, bad: int = 0) -> None:
         """Give the camera what one read of its stream brought."""
         stream = MjpegReader()
-        parts: list[Part] = stream.receive(HEAD + b"".join(map(part, pictures)) + part(b"no jpeg") * bad)
+        parts: list[MjpegPart] = stream.receive(HEAD + b"".join(map(part, pictures)) + part(b"no jpeg") * bad)
         self.took(stream, parts)
 
     def images(self) -> list[Image]:

@@ -16,7 +16,7 @@ from zbridge.camera import relay as relays
 from zbridge.camera.demand import Demand
 from zbridge.camera.mjpeg import MjpegReader
 from zbridge.camera.relay import Latest, Relay
-from zbridge.camera.settings import CameraPlan, CameraSettings, Source
+from zbridge.camera.settings import CameraPlan, CameraSettings, CameraSource
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 
@@ -51,7 +51,7 @@ async def serving(port: int = 0, *allow: str, clients: int = 16) -> AsyncIterato
     settings = CameraSettings(url="http://robot/", clients=clients)
     networks = tuple(map(ipaddress.ip_network, allow))
     scene = Scene(port or free_port(), Demand(), Latest(), Metrics(), [], [])
-    plan = CameraPlan(Source("robot", 80, "/"), settings, None, networks)
+    plan = CameraPlan(CameraSource("robot", 80, "/"), settings, None, networks)
     relay = Relay(plan, Address(HOST, scene.port), scene.demand, scene.latest, scene.metrics, scene.told.append)
     running = asyncio.create_task(relay.run())
     try:

@@ -25,7 +25,7 @@ KEPT_BYTES = PICTURE_BYTES + HEAD_BYTES + (1 << 20)
 
 def read_recording(data: bytes) -> None:
     """Read a file as MCAP; count what it holds, and find the frames of its links."""
-    found = reader.Reader(io.BytesIO(data))
+    found = reader.RecordingReader(io.BytesIO(data))
     messages, summaries = [], {}
     for message in found.messages():
         messages.append(message)

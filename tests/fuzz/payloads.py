@@ -28,7 +28,7 @@ from zbridge.views.foxglove.twist import Scale
 from zbridge.views.foxglove.twist import read_twist as read_json_twist
 from zbridge.views.ros2.cmd_vel import STAMPED, TWIST
 from zbridge.views.ros2.cmd_vel import read_twist as read_cdr_twist
-from zbridge.views.ros2.settings import Body
+from zbridge.views.ros2.settings import RobotBody
 from zbridge.views.stamps import with_stamp
 
 KINDS = sorted(
@@ -151,7 +151,7 @@ def read_cdr(data: bytes) -> None:
         require_same("written and read again", TYPES.encode(TYPES.decode(kind, written)), written)
     for twist in (TWIST, STAMPED):
         with contextlib.suppress(ProtocolError, Malformed, Unsupported):
-            drive = read_cdr_twist(TYPES, twist, body, Body())
+            drive = read_cdr_twist(TYPES, twist, body, RobotBody())
             require_drivable(drive)
 
 

@@ -14,7 +14,7 @@ from collections.abc import Callable
 
 from zbridge.bus import Bus
 from zbridge.camera.demand import Demand
-from zbridge.camera.mjpeg import MjpegReader, Part, jpeg_size
+from zbridge.camera.mjpeg import MjpegPart, MjpegReader, jpeg_size
 from zbridge.camera.pace import Pace
 from zbridge.camera.relay import Latest, Relay
 from zbridge.camera.settings import CameraPlan
@@ -61,7 +61,7 @@ class Camera:
         if plan.relay is not None:
             self._relay = Relay(plan, plan.relay, demand, latest, metrics, lambda text: conditions.set(_RELAY, text))
         self._publisher = bus.publisher(self._key, topics.IMAGE)
-        self._pace: Pace[tuple[Part, int]] = Pace(plan.settings.rate_hz)
+        self._pace: Pace[tuple[MjpegPart, int]] = Pace(plan.settings.rate_hz)
         self._timer: asyncio.TimerHandle | None = None
         self._pictures = metrics.count("camera_pictures")
         self._rejected = metrics.count("camera_not_jpeg")
@@ -125,7 +125,7 @@ class Camera:
         log.error("camera %s: %s", self._plan.source, describe(error), exc_info=error)
         return describe(error)
 
-    def _take(self, stream: MjpegReader, parts: list[Part]) -> None:
+    def _take(self, stream: MjpegReader, parts: list[MjpegPart]) -> None:
         """Take the parts of one read, of which the newest counts."""
         self._rejected.value += stream.rejected
         if not parts:

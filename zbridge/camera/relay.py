@@ -17,7 +17,7 @@ from collections.abc import Callable
 import msgspec
 
 from zbridge.camera.demand import Demand
-from zbridge.camera.mjpeg import MjpegReader, Part
+from zbridge.camera.mjpeg import MjpegPart, MjpegReader
 from zbridge.camera.settings import CameraPlan
 from zbridge.camera.upstream import explain
 from zbridge.metrics import Metrics
@@ -33,7 +33,7 @@ class Shot(msgspec.Struct, frozen=True):
     number: int
     answer: bytes
     boundary: bytes
-    part: Part
+    part: MjpegPart
 
 
 class Latest:
@@ -47,7 +47,7 @@ class Latest:
     def __repr__(self) -> str:
         return f"<Latest {self._number}>"
 
-    def show(self, stream: MjpegReader, part: Part) -> None:
+    def show(self, stream: MjpegReader, part: MjpegPart) -> None:
         """Replace the picture by a newer one."""
         self._number += 1
         self._shot = Shot(self._number, stream.head, stream.boundary, part)

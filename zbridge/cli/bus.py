@@ -91,7 +91,10 @@ async def list_sessions(settings: BusSettings, realm: str, *, as_json: bool) -> 
 
 
 def _session_table(tables: dict[tuple[str, str], tuple[SessionEntry, ...]]) -> Table:
-    titles = "robot,process,session,peer,state,version,by,in,out,lost,left out,reason".split(",")
+    titles = (
+        *("robot", "process", "session", "peer", "state", "version"),
+        *("by", "in", "out", "lost", "left out", "reason"),
+    )
     table = Table(box=None)
     for title in titles:
         table.add_column(title, no_wrap=title not in ("left out", "reason"), overflow="fold")

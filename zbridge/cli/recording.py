@@ -28,7 +28,7 @@ from zbridge.fleet.topics import KeySpace, is_name
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.protocol.plugin import Protocol, find_protocol
-from zbridge.views.recording.capture import Recording, RecordPlan, publish_mark
+from zbridge.views.recording.capture import BusCapture, RecordPlan, publish_mark
 from zbridge.views.recording.contents import Pictures, describe_configuration
 from zbridge.views.recording.export import export_arrays, export_tables, first_ns
 from zbridge.views.recording.intake import Intake
@@ -113,7 +113,7 @@ async def run_record(settings: BusSettings, options: RecordOptions) -> bool:
     plan = RecordPlan(options.realm, options.robots, keys, options.wire)
     async with joined(settings, options.realm) as bus:
         recorder.start()
-        recording = Recording(bus, plan, intake)
+        recording = BusCapture(bus, plan, intake)
         recording.open()
         errors.print(shown(f"recording {', '.join(plan.key_exprs)} to {tape.files[0]}"))
         begun = time.monotonic()

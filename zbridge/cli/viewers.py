@@ -18,20 +18,20 @@ from zbridge.metrics import Metrics
 
 if TYPE_CHECKING:
     from zbridge.views.foxglove.server import Front
-    from zbridge.views.foxglove.settings import Options
+    from zbridge.views.foxglove.settings import FoxgloveOptions
     from zbridge.views.ros2.server import View
 
 
 def run_foxglove(bus: BusSettings, realm: str, file: Path | None, given: dict[str, object]) -> None:
-    """Serve until SIGTERM or SIGINT; raise ConfigError. given: fields of Options, as they were given."""
+    """Serve until SIGTERM or SIGINT; raise ConfigError. given: fields of FoxgloveOptions, as they were given."""
     try:
         from zbridge.views.foxglove import server
-        from zbridge.views.foxglove.settings import Options, plan
+        from zbridge.views.foxglove.settings import FoxgloveOptions, plan
     except ImportError as error:
         raise ConfigError(f"{error}: expected what `pip install 'zbridge[foxglove]'` installs") from error
     gc.freeze()  # objects made at start-up live as long as the process; the collector skips them
     given["who"] = given["who"] or own_name(bus.tls) or "foxglove"
-    options: Options = Options(**given)  # type: ignore[arg-type]
+    options: FoxgloveOptions = FoxgloveOptions(**given)  # type: ignore[arg-type]
     if options.drive and (role := own_role(bus.tls)) in ("viewer", "recorder"):
         raise ConfigError(f"--drive: a {role} may not drive: expected the certificate of an operator")
     planned, metrics = plan(options), Metrics()

@@ -24,22 +24,22 @@ from zbridge.simulation.check_commands import check_commands, check_stop
 from zbridge.simulation.check_messages import check_messages
 from zbridge.simulation.check_motion import check_motion
 from zbridge.simulation.check_sessions import check_sessions
-from zbridge.simulation.check_stage import Finding, Recording, record, robot_of
+from zbridge.simulation.check_stage import CheckFinding, Transcript, record, robot_of
 
 USAGE = "usage: python -m zbridge.simulation.check NAME\n"
 ESTABLISH_S = 10.0
 """Seconds that a session with the simulated robot has to be established."""
 
 
-def check(protocol: Protocol, name: str, *, establish_s: float = ESTABLISH_S) -> Iterator[Finding]:
+def check(protocol: Protocol, name: str, *, establish_s: float = ESTABLISH_S) -> Iterator[CheckFinding]:
     """Check a protocol, installed as ``name``; yield what holds and what does not, in the order of the checks."""
     yield from check_plugin(protocol, name)
     yield from check_messages(protocol)
-    recording = Recording()
+    recording = Transcript()
     try:
         recording = asyncio.run(record(protocol, establish_s))
     except Exception as error:  # whatever the protocol's own code raises is a finding
-        yield Finding.broken(
+        yield CheckFinding.broken(
             "the session with the simulated robot is established", error, "a simulated robot that listens"
         )
         return
@@ -73,7 +73,7 @@ def main(arguments: list[str]) -> int:
     return 1 if failed else 0
 
 
-def check_plugin(protocol: Protocol, name: str) -> Iterator[Finding]:
+def check_plugin(protocol: Protocol, name: str) -> Iterator[CheckFinding]:
     """Check what the gateway needs before the first connection. name: the entry point's."""
     checks: tuple[tuple[str, Callable[[], str | None]], ...] = (
         ("the protocol has the name of its entry point", lambda: _named(protocol, name)),
@@ -81,7 +81,7 @@ def check_plugin(protocol: Protocol, name: str) -> Iterator[Finding]:
         ("a session can be shown", lambda: _shown(protocol)),
     )
     for claim, find in checks:
-        yield Finding.tried(claim, find)
+        yield CheckFinding.tried(claim, find)
 
 
 def _named(protocol: Protocol, name: str) -> str | None:

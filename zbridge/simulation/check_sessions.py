@@ -9,7 +9,7 @@ from zbridge.errors import ProtocolError
 from zbridge.fleet import payload as payloads
 from zbridge.protocol.plugin import Protocol
 from zbridge.protocol.session import State
-from zbridge.simulation.check_stage import Finding, Recording, Rehearsal, raised, robot_of
+from zbridge.simulation.check_stage import CheckFinding, Rehearsal, Transcript, raised, robot_of
 
 STEPS = 12
 """Steps of a long handshake at which something goes wrong."""
@@ -19,29 +19,29 @@ STAMP_NS, STAMP_WITHIN_NS = 10**18, 10**10
 """When the robot's messages come, and how far a stamp may be from it: a robot may have a clock of its own."""
 
 
-def check_sessions(protocol: Protocol, recording: Recording) -> Iterator[Finding]:
+def check_sessions(protocol: Protocol, recording: Transcript) -> Iterator[CheckFinding]:
     """Check the session of the driving link."""
-    yield Finding("the session with the simulated robot is established", recording.reason)
+    yield CheckFinding("the session with the simulated robot is established", recording.reason)
     if not recording.established:
         return
-    yield Finding.of(
+    yield CheckFinding.of(
         f"{len(recording.messages)} messages of the robot are translated", _translated(protocol, recording)
     )
     count = recording.unanswered
     without = f"{count} had no answer in time: see expects, answers and frame_end" if count else None
-    yield Finding("the simulated robot answers every request", without)
+    yield CheckFinding("the simulated robot answers every request", without)
     try:
         steps = _steps(protocol, recording)
     except Exception as error:
-        yield Finding.broken("what the robot said establishes a session again", error, "the same session again")
+        yield CheckFinding.broken("what the robot said establishes a session again", error, "the same session again")
         return
     tried = f"each step of the handshake ({len(steps)})"
     for claim, go_wrong in (("garbage", _garbage), ("silence", _silence), ("the end of the connection", _lost)):
         problems = [problem for step in steps for problem in _at(step, protocol, recording, go_wrong)]
-        yield Finding.of(f"{claim} at {tried} ends or spares the session", problems)
+        yield CheckFinding.of(f"{claim} at {tried} ends or spares the session", problems)
 
 
-def _steps(protocol: Protocol, recording: Recording) -> list[int]:
+def _steps(protocol: Protocol, recording: Transcript) -> list[int]:
     """List after how many frames of the robot something goes wrong: 0, all of the handshake, and some between."""
     rehearsal = Rehearsal(protocol, recording)
     frames = rehearsal.establish()
@@ -53,7 +53,7 @@ def _steps(protocol: Protocol, recording: Recording) -> list[int]:
 def _at(
     step: int,
     protocol: Protocol,
-    recording: Recording,
+    recording: Transcript,
     go_wrong: Callable[[Rehearsal, list[bytes]], Iterator[str]],
 ) -> Iterator[str]:
     try:
@@ -95,7 +95,7 @@ def _told(rehearsal: Rehearsal) -> Iterator[str]:
         yield "ended without a reason"
 
 
-def _translated(protocol: Protocol, recording: Recording) -> list[str]:
+def _translated(protocol: Protocol, recording: Transcript) -> list[str]:
     """Translate what the robot sent; telemetry has to be what its topic promises."""
     robot, problems = robot_of(protocol), []
     for name in robot.link_names:

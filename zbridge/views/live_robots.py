@@ -37,7 +37,7 @@ def read_payload(kind: type[M], payload: bytes, malformed: Count, *, arrays: boo
         return None
 
 
-class OnDemand:
+class OnDemandSubscriptions:
     """The subscriptions of one robot, by path below it. declare: subscribes to a path."""
 
     def __init__(self, declare: Callable[[str], Handle]) -> None:
@@ -45,7 +45,7 @@ class OnDemand:
         self._handles: dict[str, Handle] = {}
 
     def __repr__(self) -> str:
-        return f"<OnDemand {sorted(self._handles)}>"
+        return f"<OnDemandSubscriptions {sorted(self._handles)}>"
 
     def need(self, paths: set[str]) -> None:
         """Subscribe to these paths, and to no others."""

@@ -35,7 +35,7 @@ _END_NS = 2**32 * 1_000_000_000
 _LEVELS = {"debug": LogLevel.Debug, "chat": LogLevel.Info, "request": LogLevel.Info}
 
 
-class Channel(msgspec.Struct, frozen=True):
+class ViewerChannel(msgspec.Struct, frozen=True):
     """What a viewer can subscribe to. path: below the robot; topic: as the viewer is told.
 
     keeps_last: a late viewer needs the last message.
@@ -50,12 +50,12 @@ class Channel(msgspec.Struct, frozen=True):
 class Picture(msgspec.Struct, frozen=True):
     """One message of a channel. stamp_ns: when its content was measured, Unix nanoseconds."""
 
-    channel: Channel
+    channel: ViewerChannel
     payload: bytes
     stamp_ns: int
 
 
-def channels_of(robot: str, path: str) -> tuple[Channel, ...]:
+def channels_of(robot: str, path: str) -> tuple[ViewerChannel, ...]:
     """Return the channels that the messages of a path below the robot are drawn on; none for an unknown path."""
     topic = topics.find(path)
     if topic is None:
@@ -65,32 +65,32 @@ def channels_of(robot: str, path: str) -> tuple[Channel, ...]:
         return also
     own = _SHAPES.get(topic.message)
     schema = foxglove_schema(own) if own is not None else json_schema(topic.message)
-    return (Channel(f"/{robot}/{path}", path, schema, topic.qos.keeps_last), *also)
+    return (ViewerChannel(f"/{robot}/{path}", path, schema, topic.qos.keeps_last), *also)
 
 
-def sources_of(channel: Channel) -> tuple[str, ...]:
+def sources_of(channel: ViewerChannel) -> tuple[str, ...]:
     """Return the paths below the robot whose messages are drawn on a channel."""
     return _SOURCES.get(channel.path, (channel.path,))
 
 
-def _also(robot: str, name: str) -> Channel:
-    return Channel(f"/{robot}/{name}", name, foxglove_schema(_ALSO[name]), keeps_last=name == "trail")
+def _also(robot: str, name: str) -> ViewerChannel:
+    return ViewerChannel(f"/{robot}/{name}", name, foxglove_schema(_ALSO[name]), keeps_last=name == "trail")
 
 
-class RobotPictures:
+class FoxglovePictures:
     """Draws what one robot publishes. It keeps what the trail, the frames and the log need, and nothing else."""
 
     def __init__(self, robot: str) -> None:
         self.robot = robot
         self._map, self._base, self._scan = (f"{robot}/{frame}" for frame in ("map", "base", "scan"))
-        self._channels: dict[str, tuple[Channel, ...]] = {}
+        self._channels: dict[str, tuple[ViewerChannel, ...]] = {}
         self._trail: deque[tuple[float, float]] = deque(maxlen=TRAIL_POINTS)
         self._trail_drawn_ns = self._frames_told_ns = -_END_NS
         self._state: tuple[str, str | None] | None = None
         self._news = RefusalNews(lambda _: True)
 
     def __repr__(self) -> str:
-        return f"<RobotPictures {self.robot}>"
+        return f"<FoxglovePictures {self.robot}>"
 
     def draw(
         self, topic: Topic, message: FleetMessage, now_ns: int, wanted: Container[str] | None = None
@@ -111,7 +111,7 @@ class RobotPictures:
             for payload in self._drawn(channel, message, stamp_ns)
         ]
 
-    def _drawn(self, channel: Channel, message: FleetMessage, stamp_ns: int) -> Iterator[bytes]:
+    def _drawn(self, channel: ViewerChannel, message: FleetMessage, stamp_ns: int) -> Iterator[bytes]:
         if (also := _DRAWN_ALSO.get(channel.path)) is not None:
             yield from also(self, message, stamp_ns)
         elif isinstance(message, Scan):
@@ -184,11 +184,11 @@ _SOURCES = {
     "trail": (topics.POSE.path,),
     "log": (topics.TEXT.path, topics.STATUS.path, topics.CONTROL.path),
 }
-_Also = Callable[[RobotPictures, FleetMessage, int], Iterator[bytes]]
+_Also = Callable[[FoxglovePictures, FleetMessage, int], Iterator[bytes]]
 _DRAWN_ALSO: dict[str, _Also] = {
-    "tf": RobotPictures._frames,
-    "trail": RobotPictures._on_trail,
-    "log": RobotPictures._logged,
+    "tf": FoxglovePictures._frames,
+    "trail": FoxglovePictures._on_trail,
+    "log": FoxglovePictures._logged,
 }
 _ENCODE = msgspec.json.Encoder().encode
 """Writes NaN and infinity as null, bytes as base64."""

@@ -24,13 +24,13 @@ from zbridge.protocol.address import Address
 from zbridge.views.foxglove.admission import Policy
 from zbridge.views.foxglove.hub import Hub
 from zbridge.views.foxglove.server import MESSAGE_BYTES, Front, tls_context
-from zbridge.views.foxglove.source import Source
-from zbridge.views.pictures import Channel
+from zbridge.views.foxglove.source import ViewerSource
+from zbridge.views.pictures import ViewerChannel
 from zbridge.views.schemas import Schema
 
 HOST = "127.0.0.1"
 FOXGLOVE = Origin("https://app.foxglove.dev")
-POSE = Channel("/r1/pose", "pose", Schema("S", "jsonschema", b"{}", "json"))
+POSE = ViewerChannel("/r1/pose", "pose", Schema("S", "jsonschema", b"{}", "json"))
 
 
 class Scene:
@@ -39,7 +39,7 @@ class Scene:
     def __init__(self, policy: Policy, tls: ssl.SSLContext | None = None) -> None:
         self.hub, self.metrics = Hub(), Metrics()
         self.hub.offer([POSE])
-        self.front = Front(Source(self.hub), Address(HOST, 0), policy, self.metrics, tls)
+        self.front = Front(ViewerSource(self.hub), Address(HOST, 0), policy, self.metrics, tls)
         self.scheme = "ws" if tls is None else "wss"
         self._open = contextlib.AsyncExitStack()
 
@@ -158,7 +158,7 @@ async def test_a_viewer_that_breaks_a_limit_is_told_and_ended(monkeypatch: pytes
 async def test_an_address_in_use_and_files_that_are_no_certificate_are_told(tmp_path: Path) -> None:
     with socket.create_server((HOST, 0)) as taken:
         port = taken.getsockname()[1]
-        front = Front(Source(Hub()), Address(HOST, port), Policy(), Metrics())
+        front = Front(ViewerSource(Hub()), Address(HOST, port), Policy(), Metrics())
         with pytest.raises(ConfigError, match=f"--listen tcp://{HOST}:{port}: .*[Aa]ddress already in use"):
             await front.serve().__aenter__()
     with pytest.raises(ConfigError, match=r"--tls-certificate no\.pem, --tls-key no\.key"):

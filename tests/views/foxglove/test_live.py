@@ -15,7 +15,7 @@ from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
 from zbridge.views.foxglove.commands import RobotCommands
 from zbridge.views.foxglove.hub import Hub
-from zbridge.views.foxglove.live import Live
+from zbridge.views.foxglove.live import LiveSource
 from zbridge.views.foxglove.twist import Scales
 
 GATEWAY = "fleet/r1/@alive/gateway"
@@ -30,7 +30,7 @@ class Scene:
         self.metrics = Metrics()
         self.hub = Hub()
         commands = RobotCommands(self.hub, Fleet(self.bus), Scales(), "foxglove")
-        self.live = Live(self.hub, self.bus, "fleet", frozenset(robots), commands, self.metrics)
+        self.live = LiveSource(self.hub, self.bus, "fleet", frozenset(robots), commands, self.metrics)
         self.before = self.keys()
         self.live.start()
         self.viewer = Looking()

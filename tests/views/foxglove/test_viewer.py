@@ -14,14 +14,14 @@ from zbridge.errors import BusError, Unsupported
 from zbridge.views.foxglove.hub import Hub, Subscriber
 from zbridge.views.foxglove.replies import Service
 from zbridge.views.foxglove.requests import ClientChannel, PlaybackRequest
-from zbridge.views.foxglove.source import Source
+from zbridge.views.foxglove.source import ViewerSource
 from zbridge.views.foxglove.viewer import CALLS, PUBLISHED, RATE_HZ, SEND_S, SUBSCRIPTIONS, TOLD_HZ, Overrun, Viewer
-from zbridge.views.pictures import Channel
+from zbridge.views.pictures import ViewerChannel
 from zbridge.views.schemas import Schema
 
 pytestmark = pytest.mark.jumping
 
-CHANNELS = [Channel(f"/r1/{name}", name, Schema("S", "jsonschema", b"{}", "json")) for name in ("pose", "scan")]
+CHANNELS = [ViewerChannel(f"/r1/{name}", name, Schema("S", "jsonschema", b"{}", "json")) for name in ("pose", "scan")]
 
 
 class Connection:
@@ -47,7 +47,7 @@ class Connection:
         self.sent.append(message)
 
 
-class PlayedSource(Source):
+class PlayedSource(ViewerSource):
     """Notes what it is asked for, and refuses what the test says."""
 
     def __init__(self, hub: Hub) -> None:

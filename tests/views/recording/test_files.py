@@ -11,7 +11,7 @@ import pytest
 from tests.views.recording import files
 from zbridge.views.recording import tape as written
 from zbridge.views.recording.contents import channel_of
-from zbridge.views.recording.reader import Reader
+from zbridge.views.recording.reader import RecordingReader
 from zbridge.views.recording.tape import CHUNK_S, Tape, TapeSettings
 
 KEY = "fleet/r1/scan"
@@ -59,7 +59,7 @@ def test_a_full_chunk_is_on_the_disk_at_once(tmp_path: Path) -> None:
 
 def messages(path: Path) -> int:
     with path.open("rb") as file:
-        return len(list(Reader(file).messages()))
+        return len(list(RecordingReader(file).messages()))
 
 
 class Disk:

@@ -7,7 +7,7 @@ from msgspec.structs import replace
 
 from zbridge.app.toml import convert
 from zbridge.errors import ConfigError
-from zbridge.views.ros2.settings import Body, Ros2Settings, plan
+from zbridge.views.ros2.settings import RobotBody, Ros2Settings, plan
 
 FILE = {
     "domain": 3,
@@ -24,7 +24,7 @@ def test_defaults_are_those_of_ros() -> None:
     made = plan(Ros2Settings())
     assert (made.domain, made.distro, made.drive, made.robots) == (0, "jazzy", False, frozenset())
     assert (made.ros.connect, made.ros.effective_mode, made.ros.multicast) == (("tcp/localhost:7447",), "client", False)
-    assert made.body("r1") == Body()
+    assert made.body("r1") == RobotBody()
 
 
 def test_options_win_over_the_file() -> None:

@@ -12,8 +12,8 @@ from typing import Any, Protocol
 import msgspec
 
 from zbridge.views.foxglove import replies
-from zbridge.views.foxglove.replies import Level
-from zbridge.views.pictures import Channel
+from zbridge.views.foxglove.replies import StatusLevel
+from zbridge.views.pictures import ViewerChannel
 
 CHANNELS = 8192
 """Most channels at a time."""
@@ -45,7 +45,7 @@ class Subscriber(Protocol):
 
 
 class _Offer:
-    def __init__(self, channel_id: int, channel: Channel) -> None:
+    def __init__(self, channel_id: int, channel: ViewerChannel) -> None:
         self.id = channel_id
         self.channel = channel
         self.entry: msgspec.Raw = replies.channel_entry(channel_id, channel)
@@ -61,8 +61,10 @@ class Hub:
     """
 
     def __init__(self) -> None:
-        self.on_wanted: Callable[[Channel, bool], None] = lambda channel, wanted: None
-        self.on_subscribed: Callable[[Channel, Subscriber, int], None] = lambda channel, viewer, subscription: None
+        self.on_wanted: Callable[[ViewerChannel, bool], None] = lambda channel, wanted: None
+        self.on_subscribed: Callable[[ViewerChannel, Subscriber, int], None] = lambda channel, viewer, subscription: (
+            None
+        )
         self.viewers: set[Subscriber] = set()
         self._offers: dict[int, _Offer] = {}
         self._by_topic: dict[str, _Offer] = {}
@@ -74,7 +76,7 @@ class Hub:
 
     # The source's side
 
-    def offer(self, channels: Iterable[Channel]) -> int:
+    def offer(self, channels: Iterable[ViewerChannel]) -> int:
         """Offer channels to all viewers; those that are offered already are left. Return how many had no place."""
         new, left_out = [], 0
         for channel in channels:
@@ -127,14 +129,14 @@ class Hub:
             self.say(replies.remove_status([name]))
         else:
             self._news[name] = text
-            self.say(replies.status(Level.WARNING, text, name))
+            self.say(replies.status(StatusLevel.WARNING, text, name))
 
     def parameters_changed(self, values: Mapping[str, Any]) -> None:
         """Tell the viewers that watch these parameters."""
         for viewer in self.viewers:
             viewer.parameters_changed(values)
 
-    def wanted(self) -> list[Channel]:
+    def wanted(self) -> list[ViewerChannel]:
         """Return the channels that viewers subscribed to."""
         return [offer.channel for offer in self._offers.values() if offer.wanted_by]
 
@@ -146,7 +148,7 @@ class Hub:
         if self._offers:
             viewer.say(replies.advertise(offer.entry for offer in self._offers.values()))
         for name, text in self._news.items():
-            viewer.say(replies.status(Level.WARNING, text, name))
+            viewer.say(replies.status(StatusLevel.WARNING, text, name))
 
     def leave(self, viewer: Subscriber) -> None:
         """End a viewer's subscriptions; idempotent."""

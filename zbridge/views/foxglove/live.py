@@ -21,9 +21,9 @@ from zbridge.fleet.topics import KeySpace, Topic, split_key, unescape
 from zbridge.metrics import Metrics
 from zbridge.views.foxglove.commands import RobotCommands
 from zbridge.views.foxglove.hub import Hub
-from zbridge.views.foxglove.source import Source
-from zbridge.views.live_robots import ROBOTS, OnDemand, read_payload, watch_robots
-from zbridge.views.pictures import Channel, RobotPictures, channels_of, sources_of
+from zbridge.views.foxglove.source import ViewerSource
+from zbridge.views.live_robots import ROBOTS, OnDemandSubscriptions, read_payload, watch_robots
+from zbridge.views.pictures import FoxglovePictures, ViewerChannel, channels_of, sources_of
 from zbridge.views.schemas import Schema, json_schema
 
 SENSORS = 1024
@@ -56,15 +56,15 @@ class _Shown:
 
     def __init__(self, keys: KeySpace, subscribe: Callable[[_Shown, str], Handle]) -> None:
         self.keys = keys
-        self.pictures = RobotPictures(keys.robot)
-        self.offered: dict[str, Channel] = {}
+        self.pictures = FoxglovePictures(keys.robot)
+        self.offered: dict[str, ViewerChannel] = {}
         self.wanted: set[str] = set()
         """Paths of the channels that somebody subscribed to."""
-        self.subscribed = OnDemand(lambda source: subscribe(self, source))
+        self.subscribed = OnDemandSubscriptions(lambda source: subscribe(self, source))
         self.sensors = 0
 
 
-class Live(Source):
+class LiveSource(ViewerSource):
     """Shows the robots of a realm. robots: names of those that are shown, empty for all."""
 
     def __init__(
@@ -85,7 +85,7 @@ class Live(Source):
         hub.on_wanted = self._on_wanted
 
     def __repr__(self) -> str:
-        return f"<Live {self._realm}, {len(self._shown)} robots>"
+        return f"<LiveSource {self._realm}, {len(self._shown)} robots>"
 
     def start(self) -> None:
         """Begin to watch for robots."""
@@ -118,7 +118,7 @@ class Live(Source):
     def _show(self, name: str) -> None:
         self._shown[name] = shown = _Shown(KeySpace(self._realm, name), self._subscribe)
         channels = {channel.path: channel for path in _OFFERED for channel in channels_of(name, path)}
-        channels[_SENSORS] = Channel(f"/{name}/{_SENSORS}", _SENSORS, _sensors_schema())
+        channels[_SENSORS] = ViewerChannel(f"/{name}/{_SENSORS}", _SENSORS, _sensors_schema())
         self._offer(shown, channels.values())
         self._commands.robot_came(name)
 
@@ -161,7 +161,7 @@ class Live(Source):
 
     # Work on demand
 
-    def _on_wanted(self, channel: Channel, wanted: bool) -> None:
+    def _on_wanted(self, channel: ViewerChannel, wanted: bool) -> None:
         shown = self._shown.get(channel.topic.split("/")[1])
         if shown is None:
             return
@@ -176,7 +176,7 @@ class Live(Source):
         history = topic is not None and topic.qos.keeps_last
         return self._bus.subscribe(shown.keys.key(source), lambda sample: self._take(shown, sample), history=history)
 
-    def _sources(self, channel: Channel) -> tuple[str, ...]:
+    def _sources(self, channel: ViewerChannel) -> tuple[str, ...]:
         return (_ALL_SENSORS,) if channel.path == _SENSORS else sources_of(channel)
 
     def _take(self, shown: _Shown, sample: Sample) -> None:

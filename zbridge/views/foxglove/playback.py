@@ -14,11 +14,11 @@ from collections.abc import Iterator
 
 from zbridge.views.foxglove import replies
 from zbridge.views.foxglove.hub import Hub, Subscriber
-from zbridge.views.foxglove.recording import Message, Recording
+from zbridge.views.foxglove.recording import IndexedRecording, PlayedMessage
 from zbridge.views.foxglove.replies import PlaybackStatus
 from zbridge.views.foxglove.requests import PlaybackRequest
-from zbridge.views.foxglove.source import Source
-from zbridge.views.pictures import Channel
+from zbridge.views.foxglove.source import ViewerSource
+from zbridge.views.pictures import ViewerChannel
 from zbridge.views.recording.player import PlaybackClock
 
 BATCH = 64
@@ -33,10 +33,10 @@ RARE = ("foxglove.Grid", "zbridge.Status.v1", "zbridge.Control.v1", "zbridge.Sca
 _S_NS = 1_000_000_000
 
 
-class Playback(Source):
+class Playback(ViewerSource):
     """Plays a recording."""
 
-    def __init__(self, hub: Hub, recording: Recording) -> None:
+    def __init__(self, hub: Hub, recording: IndexedRecording) -> None:
         super().__init__(hub)
         self.capabilities = ("time", "playbackControl")
         self.times_ns = (recording.begin_ns, recording.end_ns)
@@ -83,20 +83,20 @@ class Playback(Source):
                 other.say(others)
         self._changed.set()
 
-    def _on_wanted(self, channel: Channel, wanted: bool) -> None:
+    def _on_wanted(self, channel: ViewerChannel, wanted: bool) -> None:
         if wanted:
             self._look_back.add(channel.topic)
             self._changed.set()
 
-    def _on_subscribed(self, channel: Channel, viewer: Subscriber, subscription: int) -> None:
+    def _on_subscribed(self, channel: ViewerChannel, viewer: Subscriber, subscription: int) -> None:
         self._on_wanted(channel, True)
 
     # What is shown
 
     async def run(self) -> None:
         """Show messages when their time comes, until cancelled."""
-        ahead: list[Message] = []
-        entries: Iterator[Message] = iter(())
+        ahead: list[PlayedMessage] = []
+        entries: Iterator[PlayedMessage] = iter(())
         told_at = 0.0
         while True:
             self._changed.clear()
@@ -120,7 +120,7 @@ class Playback(Source):
                 self._tell_time(ended=not ahead)
             await self._rest(ahead)
 
-    async def _rest(self, ahead: list[Message]) -> None:
+    async def _rest(self, ahead: list[PlayedMessage]) -> None:
         """Wait for the next message, the next tick, or a viewer."""
         wait_s: float | None = None
         if self._clock.playing:
@@ -131,7 +131,7 @@ class Playback(Source):
             async with asyncio.timeout(wait_s):
                 await self._changed.wait()
 
-    def _hold_back(self, ahead: list[Message], now: float) -> None:
+    def _hold_back(self, ahead: list[PlayedMessage], now: float) -> None:
         """Let the clock wait where reading cannot keep up with it."""
         if ahead and self._clock.playing and self._clock.wait_s(ahead[-1].log_ns, now) < -LATE_S:
             self._clock.seek(ahead[-1].log_ns, now)
@@ -156,7 +156,7 @@ class Playback(Source):
         if not self._clock.playing:
             self.hub.say(replies.time(at_ns))
 
-    async def _read(self, entries: Iterator[Message]) -> list[Message]:
+    async def _read(self, entries: Iterator[PlayedMessage]) -> list[PlayedMessage]:
         return await asyncio.to_thread(lambda: list(itertools.islice(entries, BATCH)))
 
     def _now_ns(self) -> int:

@@ -27,15 +27,15 @@ from zbridge.errors import ConfigError
 from zbridge.fleet.printable import shown
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
-from zbridge.views.foxglove.admission import Admission, Admitted, Policy, Request
+from zbridge.views.foxglove.admission import Admitted, Policy, UpgradeRequest, ViewerAdmission
 from zbridge.views.foxglove.commands import RobotCommands
 from zbridge.views.foxglove.hub import Hub
-from zbridge.views.foxglove.live import Live
+from zbridge.views.foxglove.live import LiveSource
 from zbridge.views.foxglove.playback import Playback
-from zbridge.views.foxglove.recording import Recording
+from zbridge.views.foxglove.recording import IndexedRecording
 from zbridge.views.foxglove.replies import SUBPROTOCOL
-from zbridge.views.foxglove.settings import Plan
-from zbridge.views.foxglove.source import Source
+from zbridge.views.foxglove.settings import FoxglovePlan
+from zbridge.views.foxglove.source import ViewerSource
 from zbridge.views.foxglove.viewer import Overrun, Viewer
 
 log = logging.getLogger("zbridge.foxglove")
@@ -60,7 +60,12 @@ class Front:
     """Serves a source at an address. tls: None for plain WebSockets."""
 
     def __init__(
-        self, source: Source, address: Address, policy: Policy, metrics: Metrics, tls: ssl.SSLContext | None = None
+        self,
+        source: ViewerSource,
+        address: Address,
+        policy: Policy,
+        metrics: Metrics,
+        tls: ssl.SSLContext | None = None,
     ) -> None:
         self.address = address
         self.viewers: set[Viewer] = set()
@@ -68,7 +73,7 @@ class Front:
         """Connections, those in their handshake too."""
         self.refused: Counter[str] = Counter()
         self._source = source
-        self._admission = Admission(policy)
+        self._admission = ViewerAdmission(policy)
         self._metrics = metrics
         self._tls = tls
         self._numbers = 0
@@ -134,7 +139,7 @@ class Front:
             offered = [
                 name for line in request.headers.get_all("Sec-WebSocket-Protocol") for name in parse_subprotocol(line)
             ]
-            asked = Request(request.path, request.headers.get_all("Origin"), offered)
+            asked = UpgradeRequest(request.path, request.headers.get_all("Origin"), offered)
             decision = self._admission.admit(asked, _host(connection), len(self.viewers))
         except (InvalidHeader, ValueError):
             self.turn_away("malformed", _host(connection))
@@ -232,7 +237,7 @@ def _port(server: Server) -> int:
 
 
 async def serve_live(
-    plan: Plan, bus: BusSettings, realm: str, metrics: Metrics, on_ready: Callable[[Front], None]
+    plan: FoxglovePlan, bus: BusSettings, realm: str, metrics: Metrics, on_ready: Callable[[Front], None]
 ) -> None:
     """Serve the robots of a realm; raise BusError or ConfigError. on_ready: called when viewers are accepted."""
     joined = await open_bus(bus, metrics, wait_for_peers=True)
@@ -242,10 +247,12 @@ async def serve_live(
         await joined.close()
 
 
-async def _serve_bus(plan: Plan, bus: Bus, realm: str, metrics: Metrics, on_ready: Callable[[Front], None]) -> None:
+async def _serve_bus(
+    plan: FoxglovePlan, bus: Bus, realm: str, metrics: Metrics, on_ready: Callable[[Front], None]
+) -> None:
     hub = Hub()
     commands = RobotCommands(hub, Fleet(bus, realm), plan.scales, plan.policy.who)
-    live = Live(hub, bus, realm, plan.robots, commands, metrics)
+    live = LiveSource(hub, bus, realm, plan.robots, commands, metrics)
     live.start()
     try:
         await _serve(plan, live, metrics, on_ready)
@@ -253,15 +260,15 @@ async def _serve_bus(plan: Plan, bus: Bus, realm: str, metrics: Metrics, on_read
         await live.close()
 
 
-async def serve_file(plan: Plan, file: Path, metrics: Metrics, on_ready: Callable[[Front], None]) -> None:
+async def serve_file(plan: FoxglovePlan, file: Path, metrics: Metrics, on_ready: Callable[[Front], None]) -> None:
     """Serve a recording; raise ZbridgeError if it cannot be read. on_ready: called when viewers are accepted."""
-    recording = await asyncio.to_thread(Recording, file)
+    recording = await asyncio.to_thread(IndexedRecording, file)
     if not recording.whole:
         log.warning("%s: has no index, as if it was cut off; it is played up to the cut", file)
     await _serve(plan, Playback(Hub(), recording), metrics, on_ready)
 
 
-async def _serve(plan: Plan, source: Source, metrics: Metrics, on_ready: Callable[[Front], None]) -> None:
+async def _serve(plan: FoxglovePlan, source: ViewerSource, metrics: Metrics, on_ready: Callable[[Front], None]) -> None:
     tls = tls_context(*plan.tls) if plan.tls is not None else None
     front = Front(source, plan.address, plan.policy, metrics, tls)
     async with front.serve(), _counters(plan, metrics):
@@ -269,6 +276,6 @@ async def _serve(plan: Plan, source: Source, metrics: Metrics, on_ready: Callabl
         await source.run()
 
 
-def _counters(plan: Plan, metrics: Metrics) -> contextlib.AbstractAsyncContextManager[object]:
+def _counters(plan: FoxglovePlan, metrics: Metrics) -> contextlib.AbstractAsyncContextManager[object]:
     """Serve the counters to Prometheus, where that was asked for."""
     return serve_metrics(plan.metrics, metrics) if plan.metrics is not None else contextlib.nullcontext()

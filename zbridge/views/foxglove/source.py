@@ -41,7 +41,7 @@ class ViewerCommands:
         """Take back what a viewer had: it is gone."""
 
 
-class Source:
+class ViewerSource:
     """A source that offers channels and refuses everything else. commands: what viewers tell its robots."""
 
     capabilities: tuple[str, ...] = ()

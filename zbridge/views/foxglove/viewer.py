@@ -17,10 +17,10 @@ from zbridge.errors import BusError, ProtocolError, Refused, Unsupported, descri
 from zbridge.fleet.printable import shown
 from zbridge.protocol.rate_limit import RateLimit
 from zbridge.views.foxglove import replies, requests
-from zbridge.views.foxglove.outbox import Outbox
-from zbridge.views.foxglove.replies import Level
+from zbridge.views.foxglove.outbox import ViewerOutbox
+from zbridge.views.foxglove.replies import StatusLevel
 from zbridge.views.foxglove.requests import ClientChannel, ServiceCall
-from zbridge.views.foxglove.source import Source
+from zbridge.views.foxglove.source import ViewerSource
 
 log = logging.getLogger("zbridge.foxglove")
 
@@ -42,7 +42,7 @@ class Overrun(Exception):
     """The viewer broke a limit and is ended."""
 
 
-class Connection(Protocol):
+class ViewerConnection(Protocol):
     """A WebSocket connection, as a viewer needs it."""
 
     def __aiter__(self) -> AsyncIterator[str | bytes]:
@@ -59,7 +59,13 @@ class Viewer:
     """A viewer of a source. name: shown to others as the driver. may_drive: whether its commands are carried out."""
 
     def __init__(
-        self, name: str, source: Source, connection: Connection, *, may_drive: bool, clock: Callable[[], float]
+        self,
+        name: str,
+        source: ViewerSource,
+        connection: ViewerConnection,
+        *,
+        may_drive: bool,
+        clock: Callable[[], float],
     ) -> None:
         self.name = name
         self.may_drive = may_drive
@@ -69,7 +75,7 @@ class Viewer:
         self._hub = source.hub
         self._connection = connection
         self._clock = clock
-        self._outbox = Outbox()
+        self._outbox = ViewerOutbox()
         self._filled = asyncio.Event()
         self._sending_since = math.inf
         self._rate = RateLimit(RATE_HZ)
@@ -126,7 +132,7 @@ class Viewer:
     def warn(self, text: str) -> None:
         """Tell the person that something was not done, a few times a second at most."""
         if self._told.take(self._clock()):
-            self.say(replies.status(Level.WARNING, shown(text)))
+            self.say(replies.status(StatusLevel.WARNING, shown(text)))
 
     def parameters_changed(self, values: Mapping[str, Any]) -> None:
         """Tell parameters that the viewer watches."""

@@ -58,7 +58,7 @@ class RecordPlan(msgspec.Struct, frozen=True):
         return () if self.keys is not None else self.robots or ("*",)
 
 
-class Recording:
+class BusCapture:
     """Gives an intake what the bus carries, from :meth:`open` to :meth:`close`."""
 
     def __init__(self, bus: Bus, plan: RecordPlan, intake: Intake) -> None:
@@ -71,7 +71,7 @@ class Recording:
         self._sessions: asyncio.Task[None] | None = None
 
     def __repr__(self) -> str:
-        return f"<Recording {self._plan.key_exprs}>"
+        return f"<BusCapture {self._plan.key_exprs}>"
 
     def open(self) -> None:
         """Subscribe."""

@@ -26,7 +26,7 @@ from zbridge.views.recording.reader import EXTRA
 from zbridge.views.schemas import Schema
 
 if TYPE_CHECKING:
-    from zbridge.views.pictures import Channel, RobotPictures
+    from zbridge.views.pictures import FoxglovePictures, ViewerChannel
 
 MSGPACK, OCTETS, JSON = "msgpack", "octet-stream", "json"
 SENT = "/@sent"
@@ -132,14 +132,14 @@ class Pictures:
 
     def __init__(self) -> None:
         try:
-            from zbridge.views.pictures import RobotPictures
+            from zbridge.views.pictures import FoxglovePictures
         except ImportError as error:
             raise ConfigError(f"pictures {EXTRA}, or --only fleet") from error
         self.undrawn = 0
         """Messages that could not be read."""
-        self._make = RobotPictures
-        self._robots: dict[str, RobotPictures] = {}
-        self._kinds: dict[Channel, ChannelKind] = {}
+        self._make = FoxglovePictures
+        self._robots: dict[str, FoxglovePictures] = {}
+        self._kinds: dict[ViewerChannel, ChannelKind] = {}
 
     def __repr__(self) -> str:
         return f"<Pictures of {len(self._robots)} robots>"
@@ -162,7 +162,7 @@ class Pictures:
         for picture in robot.draw(topic, message, now_ns):
             yield self._kind(picture.channel), picture.stamp_ns, picture.payload
 
-    def _kind(self, channel: Channel) -> ChannelKind:
+    def _kind(self, channel: ViewerChannel) -> ChannelKind:
         kind = self._kinds.get(channel)
         if kind is None:
             schema = channel.schema

@@ -18,7 +18,7 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import FleetMessage, Pose, Scan
 from zbridge.fleet.topics import split_key
 from zbridge.views.recording.contents import MSGPACK, OCTETS, message_of
-from zbridge.views.recording.reader import Message, Reader, open_recording
+from zbridge.views.recording.reader import RecordedMessage, RecordingReader, open_recording
 from zbridge.views.recording.selection import Selection
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ class Export(msgspec.Struct):
 def first_ns(path: Path) -> int:
     """Return the log time of the first message; 0 where there is none."""
     with open_recording(path) as file:
-        return next((message.log_ns for message in Reader(file).messages()), 0)
+        return next((message.log_ns for message in RecordingReader(file).messages()), 0)
 
 
 def export_tables(path: Path, folder: Path, selection: Selection) -> Export:
@@ -109,14 +109,14 @@ def export_arrays(path: Path, output: Path, selection: Selection) -> Export:
     return done
 
 
-def _chosen(path: Path, selection: Selection, done: Export) -> Iterator[Message]:
+def _chosen(path: Path, selection: Selection, done: Export) -> Iterator[RecordedMessage]:
     with open_recording(path) as file:
-        reader = Reader(file)
+        reader = RecordingReader(file)
         yield from filter(selection.takes, reader.messages())
         done.fault = None if reader.ended else reader.fault
 
 
-def _row(message: Message) -> tuple[tuple[str, ...], list[Any]]:
+def _row(message: RecordedMessage) -> tuple[tuple[str, ...], list[Any]]:
     """Return the columns and the values of a message; raise PayloadError."""
     if message.channel.encoding == OCTETS:
         return ("octets",), [message.data.hex()]
@@ -201,7 +201,7 @@ class _Columns:
         self._columns = {name: array("d") for name in names}
         self._ranges: list[Any] = []
 
-    def add(self, message: Message, decoded: FleetMessage) -> None:
+    def add(self, message: RecordedMessage, decoded: FleetMessage) -> None:
         for times, value in zip(self._times, (message.log_ns, message.publish_ns), strict=True):
             times.append(value)
         for name, column in self._columns.items():
@@ -210,15 +210,15 @@ class _Columns:
             self._ranges.append(decoded.ranges)
 
     def arrays(self, np: Any) -> dict[str, np.ndarray]:
-        times = {name: np.array(each).astype(np.int64) for name, each in zip(_ARRAY_TIMES, self._times, strict=True)}
-        ranges = {"ranges": self._filled(np)} if self._ranges else {}
-        return times | {name: np.array(column) for name, column in self._columns.items()} | ranges
+        arrays = {name: np.array(each).astype(np.int64) for name, each in zip(_ARRAY_TIMES, self._times, strict=True)}
+        arrays |= {name: np.array(column) for name, column in self._columns.items()}
+        return arrays | ({"ranges": self._filled(np)} if self._ranges else {})
 
-    def _filled(self, np: Any) -> np.ndarray:
+    def _filled(self, np: Any) -> Any:
         points = max(map(len, self._ranges))
         if points * len(self._ranges) * 4 > ARRAY_BYTES:
             raise ConfigError(f"more than {ARRAY_BYTES} bytes of scans: choose some by --keys, --from and --to")
-        filled: np.ndarray = np.full((len(self._ranges), points), np.nan, np.float32)
+        filled = np.full((len(self._ranges), points), np.nan, np.float32)
         for row, scan in zip(filled, self._ranges, strict=True):
             row[: len(scan)] = scan
         return filled

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from zbridge.views.recording.reader import Message, Reader, open_recording
+from zbridge.views.recording.reader import RecordedMessage, RecordingReader, open_recording
 from zbridge.views.recording.selection import Selection
 
 log = logging.getLogger("zbridge.views.recording")
@@ -85,10 +85,10 @@ class Player:
         self,
         path: Path,
         selection: Selection,
-        play: Callable[[Message], object],
+        play: Callable[[RecordedMessage], object],
         ended: Callable[[str | None], object],
         *,
-        skip: Callable[[Message], object] = lambda message: None,
+        skip: Callable[[RecordedMessage], object] = lambda message: None,
         speed: float = 1.0,
         loop: bool = False,
         clock: Callable[[], float] = time.monotonic,
@@ -155,7 +155,7 @@ class Player:
     def _play_once(self) -> str | None:
         begun = False
         with open_recording(self._path) as file:
-            reader = Reader(file)
+            reader = RecordingReader(file)
             for message in reader.messages():
                 if self._closing:
                     return None

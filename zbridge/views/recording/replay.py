@@ -27,7 +27,7 @@ from zbridge.protocol.session_table import SessionTable
 from zbridge.robot.ownership import Claim, Ownership, Standing
 from zbridge.views.recording.contents import MSGPACK, is_wire
 from zbridge.views.recording.player import Player
-from zbridge.views.recording.reader import Message, Reader, open_recording
+from zbridge.views.recording.reader import RecordedMessage, RecordingReader, open_recording
 from zbridge.views.recording.replayed_robot import KEYS, PROTOCOL, ReplayedRobot
 from zbridge.views.recording.selection import Selection
 from zbridge.views.recording.summary import robots_of
@@ -67,7 +67,7 @@ def survey(path: Path) -> Survey:
     keys: set[str] = set()
     statuses: dict[str, Status] = {}
     with open_recording(path) as file:
-        reader = Reader(file)
+        reader = RecordingReader(file)
         for _, message in zip(range(LOOKED_AT), reader.messages(), strict=False):
             topic = message.channel.topic
             if message.channel.encoding == MSGPACK or is_wire(topic):
@@ -141,7 +141,7 @@ class Replay:
         self._told = told
         self._ended = asyncio.Event()
         self._loop = asyncio.get_running_loop()
-        self._earlier: dict[str, Message] = {}
+        self._earlier: dict[str, RecordedMessage] = {}
         self._targets: dict[str, tuple[ReplayedRobot, str] | None] = {}
         self.player = Player(
             plan.path, plan.selection, self._play, self._on_end, speed=plan.speed, loop=plan.loop, skip=self._skip
@@ -193,20 +193,20 @@ class Replay:
 
     # The player's thread
 
-    def _skip(self, message: Message) -> None:
+    def _skip(self, message: RecordedMessage) -> None:
         """Keep the last state of each key from before the selected part: who comes later knows it, too."""
         split = split_key(message.channel.topic)
         topic = topics.find(split[2]) if split is not None else None
         if topic is not None and topic.delivery is Delivery.STATE and len(self._earlier) < KEYS:
             self._earlier[message.channel.topic] = message
 
-    def _play(self, message: Message) -> None:
+    def _play(self, message: RecordedMessage) -> None:
         earlier, self._earlier = self._earlier, {}
         for state in earlier.values():
             self._play_now(state)
         self._play_now(message)
 
-    def _play_now(self, message: Message) -> None:
+    def _play_now(self, message: RecordedMessage) -> None:
         target = self._targets.get(message.channel.topic, _UNKNOWN)
         if target is _UNKNOWN:
             target = self._target(message)
@@ -217,7 +217,7 @@ class Replay:
                 return
         self.left_out += 1
 
-    def _target(self, message: Message) -> tuple[ReplayedRobot, str] | None:
+    def _target(self, message: RecordedMessage) -> tuple[ReplayedRobot, str] | None:
         topic, target = message.channel.topic, None
         split = split_key(topic)
         if split is not None and split[0] and message.channel.encoding == MSGPACK and split[1] in self.robots:

@@ -24,7 +24,7 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, FleetMessage, Query, Refusal, Status
 from zbridge.fleet.topics import Delivery, KeySpace, Topic
 from zbridge.protocol.rate_limit import RateLimit
-from zbridge.views.recording.reader import Message
+from zbridge.views.recording.reader import RecordedMessage
 from zbridge.views.stamps import with_stamp
 
 PROTOCOL = "replay"
@@ -101,7 +101,7 @@ class ReplayedRobot:
 
     # On the player's thread
 
-    def play(self, path: str, message: Message) -> bool:
+    def play(self, path: str, message: RecordedMessage) -> bool:
         """Publish a message of the recording, whose key ends with ``path``; False: it is not published again."""
         topic = self._topic(path)
         if topic is None:

@@ -9,7 +9,7 @@ from functools import lru_cache
 import msgspec
 
 from zbridge.errors import ConfigError
-from zbridge.views.recording.reader import Message
+from zbridge.views.recording.reader import RecordedMessage
 
 _LAST_NS = 2**64
 
@@ -54,7 +54,7 @@ class Selection(msgspec.Struct, frozen=True):
     since_ns: int = 0
     until_ns: int = _LAST_NS
 
-    def takes(self, message: Message) -> bool:
+    def takes(self, message: RecordedMessage) -> bool:
         """Tell whether a message is chosen."""
         if not self.since_ns <= message.log_ns < self.until_ns:
             return False

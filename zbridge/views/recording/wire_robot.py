@@ -18,8 +18,8 @@ from pathlib import Path
 from zbridge.errors import LinkError
 from zbridge.fleet.topics import KeySpace
 from zbridge.protocol.address import Address
-from zbridge.views.recording.reader import Reader, open_recording
-from zbridge.views.recording.wire_tape import Step, steps
+from zbridge.views.recording.reader import RecordingReader, open_recording
+from zbridge.views.recording.wire_tape import WireStep, steps
 
 log = logging.getLogger("zbridge.views.recording")
 
@@ -92,7 +92,7 @@ class WireLink:
 
     async def _play_all(self) -> None:
         with open_recording(self._path) as file:
-            reader = Reader(file)
+            reader = RecordingReader(file)
             number, conversation = 0, None
             async with contextlib.AsyncExitStack() as stack:
                 for step in steps(reader.messages(), self._keys, self.link):
@@ -160,7 +160,7 @@ class _Conversation:
         self._speed = speed
         self._answered = True
 
-    async def play(self, step: Step) -> None:
+    async def play(self, step: WireStep) -> None:
         """Send a frame when it is due."""
         loop = asyncio.get_running_loop()
         await asyncio.sleep(max(0.0, self._began + step.at_s / self._speed - loop.time()))

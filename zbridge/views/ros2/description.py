@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from zbridge.ros2 import ros_name
-from zbridge.views.ros2.settings import Body
+from zbridge.views.ros2.settings import RobotBody
 
 
 class Frames(msgspec.Struct, frozen=True):
@@ -47,7 +47,7 @@ _LASER_M = 0.05
 """Radius and height of what is drawn for a scanner."""
 
 
-def urdf(robot: str, frames: Frames, body: Body) -> str:
+def urdf(robot: str, frames: Frames, body: RobotBody) -> str:
     """Write a box on the ground, and a cylinder where the scanner is. Frames have the robot's prefix."""
     laser = body.laser
     return f"""<?xml version="1.0"?>

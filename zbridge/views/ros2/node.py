@@ -15,12 +15,12 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Devices, FleetMessage
 from zbridge.fleet.topics import KeySpace, Topic, is_concrete
 from zbridge.ros2 import Kind
-from zbridge.views.live_robots import OnDemand, read_payload
+from zbridge.views.live_robots import OnDemandSubscriptions, read_payload
 from zbridge.views.ros2.holder import NAME
 from zbridge.views.ros2.outlets import Outlet, RosSide
-from zbridge.views.ros2.pictures import TOPICS, RobotPictures, RosTopic
+from zbridge.views.ros2.pictures import TOPICS, RosPictures, RosTopic
 from zbridge.views.ros2.services import Services
-from zbridge.views.ros2.settings import Body
+from zbridge.views.ros2.settings import RobotBody
 from zbridge.views.ros2.teleop import Teleop
 
 NODE = "zbridge"
@@ -38,7 +38,7 @@ class RobotNode:
     """
 
     def __init__(
-        self, side: RosSide, bus: Bus, keys: KeySpace, body: Body, *, drive: bool, own: str | None = None
+        self, side: RosSide, bus: Bus, keys: KeySpace, body: RobotBody, *, drive: bool, own: str | None = None
     ) -> None:
         self.robot = keys.robot
         self._side = side
@@ -46,13 +46,13 @@ class RobotNode:
         self._keys = keys
         self._lock = threading.Lock()
         """Streams come on Zenoh's threads, all else on the event loop's: of the pictures, and of who listens."""
-        self._pictures = RobotPictures(keys.robot, side.types, body, side.metrics)
+        self._pictures = RosPictures(keys.robot, side.types, body, side.metrics)
         self._malformed = side.metrics.count("ros2_malformed")
         self.node = side.node(f"/{self._pictures.frames.prefix}", NODE)
         self._outlets: dict[str, list[Outlet]] = {}
         self._listened: dict[str, set[Outlet]] = {}
         """The outlets of each topic that somebody listens to; topics without one are left out."""
-        self._subscribed = OnDemand(self._subscribe_to)
+        self._subscribed = OnDemandSubscriptions(self._subscribe_to)
         self._paths: dict[str, tuple[str, ...]] = {}
         self._timer: asyncio.TimerHandle | None = None
         self._closed = False

@@ -26,8 +26,8 @@ from zbridge.fleet.messages import (
 from zbridge.metrics import Metrics
 from zbridge.ros2 import KEEP_LAST_10, LATCHED, SENSOR_DATA, QoS, Types, ros_name
 from zbridge.views.ros2.description import Frames, urdf
-from zbridge.views.ros2.diagnostics import Entry, entries_of
-from zbridge.views.ros2.settings import Body
+from zbridge.views.ros2.diagnostics import Diagnostic, entries_of
+from zbridge.views.ros2.settings import RobotBody
 from zbridge.views.ros2.shapes import Shapes, Speeds, speeds_of
 from zbridge.views.stamps import measured_ns
 
@@ -122,10 +122,10 @@ Made = Iterator[tuple[str, Any]]
 """Names of topics and the ROS messages for them."""
 
 
-class RobotPictures:
+class RosPictures:
     """Makes the ROS messages of one robot: all of a topic that somebody listens to."""
 
-    def __init__(self, robot: str, types: Types, body: Body, metrics: Metrics) -> None:
+    def __init__(self, robot: str, types: Types, body: RobotBody, metrics: Metrics) -> None:
         self.robot = robot
         self.frames = Frames(ros_name(robot))
         self._types = types
@@ -144,7 +144,7 @@ class RobotPictures:
         self._names: dict[str, str] = {}
 
     def __repr__(self) -> str:
-        return f"<RobotPictures {self.robot}>"
+        return f"<RosPictures {self.robot}>"
 
     def sensors(self, devices: tuple[Device, ...]) -> list[RosTopic]:
         """Return the topics of a robot's sensors; names that are one in ROS have one topic."""
@@ -185,7 +185,7 @@ class RobotPictures:
             else:
                 self._unusable.value += 1
 
-    def diagnostics(self, more: list[Entry], now_ns: int) -> Any:
+    def diagnostics(self, more: list[Diagnostic], now_ns: int) -> Any:
         """Make a DiagnosticArray of what is known, and of ``more``."""
         make = self._types.message
         entries = [*entries_of(self.robot, self._status, self._control), *more]
@@ -269,15 +269,15 @@ class RobotPictures:
         return iter(())
 
 
-_MAKERS: dict[type[FleetMessage], Callable[[RobotPictures, str, Any, int, Container[str]], Made]] = {
-    Scan: RobotPictures._on_scan,
-    Scanner: RobotPictures._on_state,
-    Pose: RobotPictures._on_pose,
-    Motion: RobotPictures._on_motion,
-    Map: RobotPictures._on_map,
-    Battery: RobotPictures._on_battery,
-    Image: RobotPictures._on_image,
-    Reading: RobotPictures._on_reading,
-    Status: RobotPictures._on_state,
-    Control: RobotPictures._on_state,
+_MAKERS: dict[type[FleetMessage], Callable[[RosPictures, str, Any, int, Container[str]], Made]] = {
+    Scan: RosPictures._on_scan,
+    Scanner: RosPictures._on_state,
+    Pose: RosPictures._on_pose,
+    Motion: RosPictures._on_motion,
+    Map: RosPictures._on_map,
+    Battery: RosPictures._on_battery,
+    Image: RosPictures._on_image,
+    Reading: RosPictures._on_reading,
+    Status: RosPictures._on_state,
+    Control: RosPictures._on_state,
 }

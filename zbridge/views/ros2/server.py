@@ -16,7 +16,7 @@ from zbridge.ros2 import ros_name, types_of
 from zbridge.views.live_robots import ROBOTS, watch_robots
 from zbridge.views.ros2.node import RobotNode
 from zbridge.views.ros2.outlets import RosSide
-from zbridge.views.ros2.settings import Plan
+from zbridge.views.ros2.settings import Ros2Plan
 
 log = logging.getLogger("zbridge.ros2")
 
@@ -24,7 +24,7 @@ HIDDEN_AFTER_S = 2.0
 """A robot whose gateway is away for less keeps its node."""
 
 
-async def serve(plan: Plan, bus: BusSettings, metrics: Metrics, on_ready: Callable[[View], None]) -> None:
+async def serve(plan: Ros2Plan, bus: BusSettings, metrics: Metrics, on_ready: Callable[[View], None]) -> None:
     """Show robots until cancelled; raise BusError or ConfigError. on_ready: called when robots are looked for."""
     types = types_of(plan.distro)
     fleet = await open_bus(bus, metrics, wait_for_peers=True, realm=plan.realm, threads=False)
@@ -49,7 +49,7 @@ async def serve(plan: Plan, bus: BusSettings, metrics: Metrics, on_ready: Callab
         await fleet.close()
 
 
-def _apart(fleet: Bus, ros: Bus, plan: Plan) -> None:
+def _apart(fleet: Bus, ros: Bus, plan: Ros2Plan) -> None:
     """Raise ConfigError where both sessions are at one router: a fleet's rules do not know ROS's keys."""
     if set(fleet.routers()) & set(ros.routers()) or fleet.zid in ros.routers():
         where = ", ".join(plan.ros.connect)
@@ -62,7 +62,7 @@ def _apart(fleet: Bus, ros: Bus, plan: Plan) -> None:
 class View:
     """The robots of a realm as nodes. own: our name on the fleet's bus, if a certificate says one."""
 
-    def __init__(self, plan: Plan, fleet: Bus, side: RosSide, own: str | None) -> None:
+    def __init__(self, plan: Ros2Plan, fleet: Bus, side: RosSide, own: str | None) -> None:
         self._own = own
         self._plan = plan
         self._fleet = fleet

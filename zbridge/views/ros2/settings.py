@@ -28,7 +28,7 @@ class Mount(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     yaw: Annotated[float, msgspec.Meta(ge=-math.tau, le=math.tau)] = 0.0
 
 
-class Body(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class RobotBody(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What ROS has to know of a robot, and no robot of ours tells.
 
     speed_full_mps, turn_full_radps: its speeds at full scale. wheelbase_m: of a robot that steers, between its axles;
@@ -60,11 +60,11 @@ class Ros2Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     drive: bool = False
     realm: str = "fleet"
     bus: BusSettings | None = None
-    others: Body = Body()
-    robot: dict[str, Body] = {}
+    others: RobotBody = RobotBody()
+    robot: dict[str, RobotBody] = {}
 
 
-class Plan(msgspec.Struct, frozen=True):
+class Ros2Plan(msgspec.Struct, frozen=True):
     """What the view starts from. robots: those that are shown, empty for all."""
 
     domain: int
@@ -73,15 +73,15 @@ class Plan(msgspec.Struct, frozen=True):
     realm: str
     robots: frozenset[str]
     drive: bool
-    others: Body
-    bodies: Mapping[str, Body]
+    others: RobotBody
+    bodies: Mapping[str, RobotBody]
 
-    def body(self, robot: str) -> Body:
+    def body(self, robot: str) -> RobotBody:
         """Return what is known of a robot."""
         return self.bodies.get(robot, self.others)
 
 
-def plan(settings: Ros2Settings) -> Plan:
+def plan(settings: Ros2Settings) -> Ros2Plan:
     """Check the settings; raise ConfigError, which names what is wrong."""
     if not 0 <= settings.domain <= 232:  # as DDS has it
         raise ConfigError(f"domain = {settings.domain}: expected 0 to 232")
@@ -96,7 +96,7 @@ def plan(settings: Ros2Settings) -> Plan:
         ros = msgspec.convert({"mode": "client", "connect": connect, "multicast": False}, BusSettings)
     except msgspec.ValidationError as error:
         raise ConfigError(f"ros = {list(connect)}: expected Zenoh endpoints like {ROS_ROUTER!r}") from error
-    return Plan(
+    return Ros2Plan(
         domain=settings.domain,
         distro=settings.distro,
         ros=ros,

@@ -21,11 +21,11 @@ from zbridge.fleet.messages import Control, Drive
 from zbridge.protocol.rate_limit import RateLimit
 from zbridge.ros2 import KEEP_LAST_10, Endpoint, Kind, Node, endpoints_of, read_attachment, read_token
 from zbridge.views.ros2.cmd_vel import MOST_BYTES, read_twist
-from zbridge.views.ros2.diagnostics import MOST_VALUES, OK, WARN, Entry, cut
+from zbridge.views.ros2.diagnostics import MOST_VALUES, OK, WARN, Diagnostic, cut
 from zbridge.views.ros2.driving import PUBLISHERS, QUIET_S, Action, Decision, Driving, Standing
 from zbridge.views.ros2.holder import Holder
 from zbridge.views.ros2.outlets import RosSide
-from zbridge.views.ros2.settings import Body
+from zbridge.views.ros2.settings import RobotBody
 
 RATE_HZ = 200.0
 """Commands a second of one publisher that are heard."""
@@ -48,7 +48,7 @@ class Teleop:
     """
 
     def __init__(
-        self, side: RosSide, node: Node, robot: Robot, body: Body, fleet: Bus, control_key: str, name: str
+        self, side: RosSide, node: Node, robot: Robot, body: RobotBody, fleet: Bus, control_key: str, name: str
     ) -> None:
         self._side = side
         self._robot = robot
@@ -273,7 +273,7 @@ class Teleop:
 
     # What is told
 
-    def diagnostics(self) -> Entry:
+    def diagnostics(self) -> Diagnostic:
         """Return who drives, and why others may not."""
         publishers = list(self._driving.publishers.values())[:MOST_VALUES]
         values = [(cut(publisher.name), _standing(publisher.standing, publisher.why)) for publisher in publishers]
@@ -285,7 +285,7 @@ class Teleop:
         if owing:
             text += f"; {owing[0].name} is refused: {_standing(Standing.OWES, owing[0].why)}"
         level = WARN if owing or self._wrong else OK
-        return Entry(level, f"{self._robot.name}: cmd_vel", cut(text), values[:MOST_VALUES])
+        return Diagnostic(level, f"{self._robot.name}: cmd_vel", cut(text), values[:MOST_VALUES])
 
 
 def _standing(standing: Standing, why: str) -> str:

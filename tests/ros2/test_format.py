@@ -16,8 +16,8 @@ from zbridge.ros2 import (
     Endpoint,
     Kind,
     Node,
-    QoS,
     Reliability,
+    RosQoS,
     all_tokens,
     dds_type,
     endpoints_of,
@@ -82,8 +82,8 @@ QOS = {
     "::,10:,:,:,,": KEEP_LAST_10,
     ":1:,1:,:,:,,": LATCHED,
     "2::,5:,:,:,,": SENSOR_DATA,
-    "::,:,:,:,,": QoS(depth=42),
-    "2:1:2,:,:,:,,": QoS(Reliability.BEST_EFFORT, Durability.TRANSIENT_LOCAL, 0),
+    "::,:,:,:,,": RosQoS(depth=42),
+    "2:1:2,:,:,:,,": RosQoS(Reliability.BEST_EFFORT, Durability.TRANSIENT_LOCAL, 0),
 }
 NAMES = {"r1": "r1", "front left": "front_left", "7": "_7", "": "_", "a-b.c": "a_b_c", "Ä": "_"}
 
@@ -134,7 +134,7 @@ def test_a_gid_is_the_xxh3_128_of_the_token_low_half_first() -> None:
 
 
 @pytest.mark.parametrize(("text", "qos"), QOS.items())
-def test_qos_is_read_and_written(text: str, qos: QoS) -> None:
+def test_qos_is_read_and_written(text: str, qos: RosQoS) -> None:
     assert str(qos) == text
     assert read_qos(text) == qos
 
@@ -185,10 +185,10 @@ def test_all_tokens_of_a_domain_or_of_a_kind_are_asked_for() -> None:
 
 
 FOREIGN_QOS = {  # other numbers of rmw's policies, as rmw_zenoh may write them
-    "1:2:1,7:,:,:,,": QoS(depth=7),
-    "0:0:0,:,:,:,,": QoS(depth=42),
-    "3:3:3,1:,:,:,,": QoS(depth=1),
-    "2:1:2,9:,:,:,,": QoS(Reliability.BEST_EFFORT, Durability.TRANSIENT_LOCAL, 0),
+    "1:2:1,7:,:,:,,": RosQoS(depth=7),
+    "0:0:0,:,:,:,,": RosQoS(depth=42),
+    "3:3:3,1:,:,:,,": RosQoS(depth=1),
+    "2:1:2,9:,:,:,,": RosQoS(Reliability.BEST_EFFORT, Durability.TRANSIENT_LOCAL, 0),
     "::,10:,:,:,,:more": KEEP_LAST_10,
     "4::,10:,:,:,,": None,
     ":4:,10:,:,:,,": None,

@@ -74,7 +74,7 @@ class Durability(IntEnum):
     VOLATILE = 2
 
 
-class QoS(msgspec.Struct, frozen=True):
+class RosQoS(msgspec.Struct, frozen=True):
     """How an endpoint sends or wants messages. depth: kept messages; 0: all of them.
 
     Deadline, lifespan and liveliness are always the defaults.
@@ -93,7 +93,7 @@ class QoS(msgspec.Struct, frozen=True):
         return f"{reliability}:{durability}:{history},{depth}:,:,:,,"
 
 
-def read_qos(text: str) -> QoS | None:
+def read_qos(text: str) -> RosQoS | None:
     """Read the quality of service of a token; None where it is none. Only the first three fields are looked at."""
     parts = text.split(":")
     if len(parts) < 6:
@@ -106,7 +106,7 @@ def read_qos(text: str) -> QoS | None:
         return None
     if depth and not (depth.isascii() and depth.isdigit() and len(depth) < 19):
         return None
-    return QoS(reliability, durability, 0 if history == "2" else int(depth or _DEFAULT_DEPTH))
+    return RosQoS(reliability, durability, 0 if history == "2" else int(depth or _DEFAULT_DEPTH))
 
 
 _RELIABILITIES = {
@@ -123,10 +123,10 @@ _DURABILITIES = {
     "2": Durability.VOLATILE,
     "3": Durability.VOLATILE,
 }
-KEEP_LAST_10 = QoS()
-SENSOR_DATA = QoS(Reliability.BEST_EFFORT, depth=5)
+KEEP_LAST_10 = RosQoS()
+SENSOR_DATA = RosQoS(Reliability.BEST_EFFORT, depth=5)
 """rmw_qos_profile_sensor_data."""
-LATCHED = QoS(durability=Durability.TRANSIENT_LOCAL, depth=1)
+LATCHED = RosQoS(durability=Durability.TRANSIENT_LOCAL, depth=1)
 """Who comes late gets the last message."""
 SERVICES = KEEP_LAST_10
 """rmw_qos_profile_services_default."""
@@ -220,7 +220,7 @@ class Endpoint(msgspec.Struct, frozen=True):
     name: str
     type_name: str
     type_hash: str
-    qos: QoS = KEEP_LAST_10
+    qos: RosQoS = KEEP_LAST_10
     token_read: str | None = None
 
     @property

@@ -24,7 +24,7 @@ from zbridge.fleet.messages import (
     Status,
 )
 from zbridge.metrics import Metrics
-from zbridge.ros2 import KEEP_LAST_10, LATCHED, SENSOR_DATA, QoS, Types, ros_name
+from zbridge.ros2 import KEEP_LAST_10, LATCHED, SENSOR_DATA, RosQoS, Types, ros_name
 from zbridge.views.ros2.description import Frames, urdf
 from zbridge.views.ros2.diagnostics import Diagnostic, entries_of
 from zbridge.views.ros2.settings import RobotBody
@@ -86,7 +86,7 @@ class RosTopic(msgspec.Struct, frozen=True):
 
     name: str
     type_name: str
-    qos: QoS = KEEP_LAST_10
+    qos: RosQoS = KEEP_LAST_10
     paths: tuple[str, ...] = ()
     everywhere: bool = False
 
@@ -104,7 +104,7 @@ TOPICS = (
     RosTopic("battery_state", "sensor_msgs/msg/BatteryState", KEEP_LAST_10, (topics.BATTERY.path,)),
     RosTopic("image/compressed", "sensor_msgs/msg/CompressedImage", SENSOR_DATA, (topics.IMAGE.path,)),
     RosTopic("map", "nav_msgs/msg/OccupancyGrid", LATCHED, (topics.MAP.path,)),
-    RosTopic("tf", "tf2_msgs/msg/TFMessage", QoS(depth=100), (topics.POSE.path, topics.MOTION.path), True),
+    RosTopic("tf", "tf2_msgs/msg/TFMessage", RosQoS(depth=100), (topics.POSE.path, topics.MOTION.path), True),
     RosTopic("tf_static", "tf2_msgs/msg/TFMessage", LATCHED, (), True),
     RosTopic(
         "diagnostics",

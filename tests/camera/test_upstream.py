@@ -63,7 +63,7 @@ async def test_a_camera_that_sends_bad_parts_quickly_is_ended_in_time(monkeypatc
 async def test_bad_parts_without_any_rest_do_not_hide_the_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
     """What waits in the buffer is read without waiting: no timeout of a read can end that."""
     loop = asyncio.get_running_loop()
-    monkeypatch.setattr(upstream.Budget, "rest_s", lambda *_: 0.01)
+    monkeypatch.setattr(upstream.ReadBudget, "pause_s", lambda *_: 0.01)
     begun = loop.time()
     took_s, pictures, why = await fetched(monkeypatch, HEAD, *[BAD * (READ_BYTES // len(BAD))] * 1000)
     assert (took_s, pictures, why) == (pytest.approx(STALL_S, abs=0.05), 0, "no picture for 3 s")

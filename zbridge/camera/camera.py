@@ -81,7 +81,7 @@ class Camera:
                 if self._relay is not None:
                     tasks.create_task(self._relay.run())
         finally:
-            self._rest()
+            self._reset()
             watch.close()
             self._publisher.close()
             for name in (_CONDITION, _RELAY):
@@ -96,7 +96,7 @@ class Camera:
             await self._demand.begin()
             begun = self._loop.time()
             reason = await self._fetch()
-            self._rest()
+            self._reset()
             if self._loop.time() - begun >= STEADY_S:
                 backoff.reset()
             if reason is None:
@@ -111,7 +111,7 @@ class Camera:
     async def _fetch(self) -> str | None:
         """Fetch until the stream ends; return why it ended. None: nobody watches any more."""
         log.info("camera %s: connecting", self._plan.source)
-        fetching = asyncio.create_task(fetch(self._plan.source, self._plan.settings.stall_s, self._take))
+        fetching = asyncio.create_task(fetch(self._plan.source, self._plan.settings.stall_s, self._receive))
         idle = asyncio.create_task(self._demand.end())
         try:
             await asyncio.wait((fetching, idle), return_when=asyncio.FIRST_COMPLETED)
@@ -125,7 +125,7 @@ class Camera:
         log.error("camera %s: %s", self._plan.source, describe(error), exc_info=error)
         return describe(error)
 
-    def _take(self, stream: MjpegReader, parts: list[MjpegPart]) -> None:
+    def _receive(self, stream: MjpegReader, parts: list[MjpegPart]) -> None:
         """Take the parts of one read, of which the newest counts."""
         self._rejected.value += stream.rejected
         if not parts:
@@ -159,7 +159,7 @@ class Camera:
         self._timer = None
         self._publish()
 
-    def _rest(self) -> None:
+    def _reset(self) -> None:
         """Forget the pictures of a stream that has ended."""
         self._latest.forget()
         if self._timer is not None:

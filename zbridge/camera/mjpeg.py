@@ -72,7 +72,7 @@ def jpeg_size(data: bytes) -> tuple[int, int] | None:
 
 
 HEAD_BYTES = 16 * 1024
-"""Bound of the HTTP head, of what stands before the first part, and of a part's header."""
+"""Bound of the HTTP head, of what precedes the first part, and of a part's header."""
 PICTURE_BYTES = 4 * 1024 * 1024
 """Bound of one picture."""
 _BREAKS = 4
@@ -133,7 +133,7 @@ class MjpegReader:
         parts, self._parts = self._parts, []
         return parts
 
-    # One method for each step; True: it is done, go on with the next
+    # One method for each step; True: it is done, continue with the next
 
     def _read_answer(self) -> bool:
         head = self._take_head("an HTTP head")

@@ -21,7 +21,7 @@ class ReadBudget:
     def __repr__(self) -> str:
         return f"<ReadBudget used until {self._paid_until:g}>"
 
-    def rest_s(self, size: int, pictures: int, now: float) -> float:
+    def pause_s(self, size: int, pictures: int, now: float) -> float:
         """Count bytes and pictures that were read; return for how long nothing is to be read, seconds."""
         self._paid_until = max(self._paid_until, now - 1.0) + max(size / BYTES_S, pictures / PICTURES_S)
         return max(0.0, self._paid_until - now)

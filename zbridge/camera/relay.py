@@ -2,8 +2,8 @@
 
 Deployed programs read multipart naively. So they get what the camera itself wrote: its HTTP head, and of each picture
 the delimiter and header, byte for byte and in their order. Each client has a task of its own that sends the newest
-picture, waits until the socket has taken it, and goes on with the newest then: a slow client sees fewer pictures and
-holds nobody up. Clients are accepted one by one, bounded in number; refused ones are closed at most 100 a second.
+picture, waits until the socket has accepted it, and continues with the newest then: a slow client sees fewer pictures
+and delays nobody. Clients are accepted one by one, bounded in number; refused ones are closed at most 100 a second.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ _FORBIDDEN = b"HTTP/1.0 403 Forbidden\r\nContent-Length: 0\r\n\r\n"
 
 
 class Relay:
-    """Listens at ``address`` until cancelled. tell: shows people why it does not listen; None: it does."""
+    """Listens at ``address`` until cancelled. report: shows people why it does not listen; None: it does."""
 
     def __init__(
         self,
@@ -92,14 +92,14 @@ class Relay:
         demand: Demand,
         latest: Latest,
         metrics: Metrics,
-        tell: Callable[[str | None], object],
+        report: Callable[[str | None], object],
     ) -> None:
         self._address = address
         self._allow = plan.allow
         self._most = plan.settings.clients
         self._demand = demand
         self._latest = latest
-        self._tell = tell
+        self._report = report
         self._clients: set[asyncio.Task[None]] = set()
         self._accepted = metrics.count("camera_relay_accepted")
         self._refused = metrics.count("camera_relay_refused")
@@ -116,10 +116,10 @@ class Relay:
             try:
                 sockets = await waiting_sockets(self._address)
             except OSError as error:
-                self._tell(f"camera relay {self._address.host}:{self._address.port}: {explain(error)}")
+                self._report(f"camera relay {self._address.host}:{self._address.port}: {explain(error)}")
                 await asyncio.sleep(backoff.delay_s())
                 continue
-            self._tell(None)
+            self._report(None)
             log.info("camera: HQ programs find %s at %s", PATH.decode(), self._address)
             try:
                 async with asyncio.TaskGroup() as tasks:

@@ -85,19 +85,19 @@ START_S = 20.0
 """Longest time a process may take to start."""
 DAYS = 60
 """How long the certificates are valid: no warning of their end is shown."""
-_ROUTER, _LOOKS, _DRIVES, _READER = "hub", "screen", "demo", "you"
+_ROUTER, _VIEWER, _OPERATOR, _READER = "hub", "screen", "demo", "you"
 
 
 class DemoBus(msgspec.Struct, frozen=True):
     """How the parts of a demo use its bus.
 
-    looking: the session of the table. driving: the robots as the program that drives them sees them. table: the
+    viewer: the session of the table. operator: the robots as the program that drives them sees them. table: the
     ``[bus]`` table of a robot's gateway. commands: what to try in another terminal.
     """
 
     endpoint: str
-    looking: Bus
-    driving: Fleet
+    viewer: Bus
+    operator: Fleet
     table: Callable[[str], str]
     commands: tuple[str, ...]
 
@@ -111,14 +111,14 @@ async def secure_bus(folder: Path, log: IO[bytes], robots: list[str]) -> AsyncIt
     async with contextlib.AsyncExitStack() as stack:
         listening = ("--listen", endpoint, "--tls", str(folder / _ROUTER), "--roles", str(roles))
         await stack.enter_async_context(process(log, "router", *listening))
-        looking = await stack.enter_async_context(_joined(folder / _LOOKS))
-        driving = await stack.enter_async_context(_joined(folder / _DRIVES))
+        viewer = await stack.enter_async_context(_joined(folder / _VIEWER))
+        operator = await stack.enter_async_context(_joined(folder / _OPERATOR))
         commands = (
-            f"zbridge ls --sessions --tls {folder / _LOOKS}     # a viewer: looks and stops, and drives nothing",
+            f"zbridge ls --sessions --tls {folder / _VIEWER}     # a viewer: looks and stops, and drives nothing",
             f"zbridge drive {robots[0]} --tls {folder / _READER}     # an operator",
         )
-        fleet = Fleet(driving, REALM, _DRIVES)
-        yield DemoBus(endpoint, looking, fleet, lambda robot: _table(folder / gateways[robot]), commands)
+        fleet = Fleet(operator, REALM, _OPERATOR)
+        yield DemoBus(endpoint, viewer, fleet, lambda robot: _table(folder / gateways[robot]), commands)
 
 
 def make_members(folder: Path, endpoint: str, gateways: dict[str, str]) -> Path:
@@ -134,8 +134,8 @@ def make_members(folder: Path, endpoint: str, gateways: dict[str, str]) -> Path:
 
     members = {
         _ROUTER: Member("router"),
-        _LOOKS: Member("viewer"),
-        _DRIVES: Member("operator"),
+        _VIEWER: Member("viewer"),
+        _OPERATOR: Member("operator"),
         _READER: Member("operator"),
         **{name: Member("gateway", (robot,), listeners=True) for robot, name in gateways.items()},
     }

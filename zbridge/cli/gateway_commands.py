@@ -39,7 +39,7 @@ async def unlatch(settings: BusSettings, realm: str, robot: str | None) -> bool:
             return _report(await fleet.unlatch(), "unlatched", realm)
         released = await fleet[robot].unlatch()
     for latch in released:
-        console.print(shown(f"{robot}: released the stop {_told(latch)}"))
+        console.print(shown(f"{robot}: released the stop {_described(latch)}"))
     if not released:
         console.print(f"{robot}: was not latched")
     return True
@@ -76,7 +76,7 @@ def _finding(error: Exception) -> str:
     return "refused" if isinstance(error, Refused) else "did not confirm"
 
 
-def _told(latch: Latch) -> str:
+def _described(latch: Latch) -> str:
     reason = f" ({latch.reason})" if latch.reason else ""
     return f"of {latch.who or 'somebody'}{reason}"
 

@@ -261,7 +261,7 @@ async def run_replay(settings: BusSettings, options: ReplayOptions) -> None:
 
 @contextlib.contextmanager
 def _keys(player: Player) -> Iterator[None]:
-    """Let Enter pause the player, and go on."""
+    """Let Enter pause and resume the player."""
     loop, stdin = asyncio.get_running_loop(), sys.stdin.fileno()
 
     def pressed() -> None:

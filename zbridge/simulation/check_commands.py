@@ -172,7 +172,7 @@ def _give(rehearsal: Rehearsal, topic: Topic, command: FleetMessage) -> str:
 def _established(protocol: Protocol, recording: Transcript) -> Rehearsal:
     rehearsal = Rehearsal(protocol, recording)
     frames = rehearsal.establish()
-    rehearsal.play(recording.heard[frames : frames + MORE_FRAMES])
+    rehearsal.play(recording.received[frames : frames + MORE_FRAMES])
     if rehearsal.session.state is not State.ESTABLISHED:
         raise RuntimeError(f"{rehearsal.session!r} after what established it before")
     return rehearsal

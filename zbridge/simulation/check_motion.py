@@ -128,11 +128,11 @@ class _Seen:
         return (last.x - first.x) * math.cos(first.heading) + (last.y - first.y) * math.sin(first.heading)
 
     def moves(self, idle: _Seen, expected_m: float) -> CheckFinding:
-        """Tell whether it moved, or at least was told so."""
+        """Tell whether it moved, or at least was commanded so."""
         claim = "the simulated robot drives"
         if not self.poses and not self.speeds:
-            told = bool(self.written - idle.written)
-            return CheckFinding(claim, None if told else "nothing is written for a drive", "seen on the wire only")
+            commanded = bool(self.written - idle.written)
+            return CheckFinding(claim, None if commanded else "nothing is written for a drive", "seen on the wire only")
         if self.poses and self.way_m < MOVED_M:
             return CheckFinding(claim, f"it moved {self.way_m:.3f} m ahead in {DRIVE_S:g} s")
         if self.poses and (unlike := _unlike(self.way_m, expected_m, "m")):
@@ -142,11 +142,11 @@ class _Seen:
         return CheckFinding(claim, None, f"{self.way_m:.2f} m" if self.poses else "by its speed")
 
     def stands(self, stop: _Seen, drive: _Seen) -> CheckFinding:
-        """Tell whether it stood after the stop, or at least was told so."""
+        """Tell whether it stood after the stop, or at least was commanded so."""
         claim = "the simulated robot stands after its stop"
         if not self.poses and not self.speeds:
-            told = bool(stop.written - drive.written)
-            return CheckFinding(claim, None if told else "nothing is written for a stop", "seen on the wire only")
+            commanded = bool(stop.written - drive.written)
+            return CheckFinding(claim, None if commanded else "nothing is written for a stop", "seen on the wire only")
         if self.poses and abs(self.way_m) > MOVED_M:
             return CheckFinding(claim, f"it moves on: {self.way_m:.3f} m in {WATCHED_S:g} s")
         if self.speeds and abs(self.speeds[-1]) > MOVING:

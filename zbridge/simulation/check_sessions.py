@@ -59,9 +59,9 @@ def _at(
     try:
         for seed in range(SEEDS):
             rehearsal = Rehearsal(protocol, recording)
-            rehearsal.play(recording.heard[:step])
+            rehearsal.play(recording.received[:step])
             noise = random.Random(seed).randbytes(GARBAGE_BYTES)
-            for problem in go_wrong(rehearsal, [noise, *recording.heard[step : step + 3]]):
+            for problem in go_wrong(rehearsal, [noise, *recording.received[step : step + 3]]):
                 yield f"after {step} frames: {problem}"
     except Exception as error:  # whatever the protocol's own code raises is a finding
         yield f"after {step} frames: {raised(error, 'a session that goes on, or Session.fail with a reason')}"
@@ -70,7 +70,7 @@ def _at(
 def _garbage(rehearsal: Rehearsal, frames: list[bytes]) -> Iterator[str]:
     rehearsal.play(frames)
     rehearsal.run(1.0)
-    yield from _told(rehearsal)
+    yield from _without_reason(rehearsal)
 
 
 def _silence(rehearsal: Rehearsal, frames: list[bytes]) -> Iterator[str]:
@@ -78,7 +78,7 @@ def _silence(rehearsal: Rehearsal, frames: list[bytes]) -> Iterator[str]:
     rehearsal.run(limit_s, answers=False)
     if rehearsal.session.state in (State.CONNECTING, State.HANDSHAKING):
         yield f"still {rehearsal.session.state.value} after {limit_s:g} s of silence"
-    yield from _told(rehearsal)
+    yield from _without_reason(rehearsal)
 
 
 def _lost(rehearsal: Rehearsal, frames: list[bytes]) -> Iterator[str]:
@@ -87,10 +87,10 @@ def _lost(rehearsal: Rehearsal, frames: list[bytes]) -> Iterator[str]:
     rehearsal.run(1.0)
     if session.state is not State.CLOSED or session.deadline() is not None or session.receive(frames[0], rehearsal.now):
         yield f"{session!r} still does something when its connection is gone"
-    yield from _told(rehearsal)
+    yield from _without_reason(rehearsal)
 
 
-def _told(rehearsal: Rehearsal) -> Iterator[str]:
+def _without_reason(rehearsal: Rehearsal) -> Iterator[str]:
     if rehearsal.session.over and not rehearsal.session.reason:
         yield "ended without a reason"
 

@@ -73,7 +73,7 @@ _SHOWN = 3
 
 
 SHOWN_S = 1.0
-"""Seconds that a recording goes on after the session was established."""
+"""Seconds that a recording continues after the session was established."""
 HANG_UP_S = 0.2
 """Seconds that the simulated robot is given to see that its peer is gone."""
 STEP_S = 0.01
@@ -87,7 +87,7 @@ _ANSWER_FRAMES = 8
 class Transcript(msgspec.Struct):
     """What was said on the driving link, and whether all links were established. ``answers``: what followed a frame."""
 
-    heard: list[bytes] = []
+    received: list[bytes] = []
     answers: dict[bytes, list[bytes]] = {}
     messages: list[Any] = []
     established: bool = False
@@ -236,13 +236,13 @@ class Rehearsal:
 
     def establish(self) -> int:
         """Let the robot say what it said, until the session is established; give how many frames that took."""
-        for count, frame in enumerate(self._recording.heard):
+        for count, frame in enumerate(self._recording.received):
             self.run(STEP_S)
             if self.session.state is not State.HANDSHAKING:
                 return count
             self._hear(frame)
         self.run(1.0)
-        return len(self._recording.heard)
+        return len(self._recording.received)
 
     def run(self, seconds: float, *, answers: bool = True) -> list[bytes]:
         """Let time pass and write what is due; give what was written. Raise RuntimeError where that never ends.

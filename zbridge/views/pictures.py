@@ -85,7 +85,7 @@ class FoxglovePictures:
         self._map, self._base, self._scan = (f"{robot}/{frame}" for frame in ("map", "base", "scan"))
         self._channels: dict[str, tuple[ViewerChannel, ...]] = {}
         self._trail: deque[tuple[float, float]] = deque(maxlen=TRAIL_POINTS)
-        self._trail_drawn_ns = self._frames_told_ns = -_END_NS
+        self._trail_drawn_ns = self._frames_sent_ns = -_END_NS
         self._state: tuple[str, str | None] | None = None
         self._news = RefusalNews(lambda _: True)
 
@@ -132,10 +132,10 @@ class FoxglovePictures:
         """Tell where the frames are: with every pose, and once a second where only scans come."""
         scanner = (self._base, self._scan, None)
         if isinstance(message, Pose) and _is_finite(message):
-            self._frames_told_ns = stamp_ns
+            self._frames_sent_ns = stamp_ns
             yield foxglove_messages.transforms(((self._map, self._base, message), scanner), stamp_ns)
-        elif abs(stamp_ns - self._frames_told_ns) >= FRAMES_EVERY_NS:
-            self._frames_told_ns = stamp_ns
+        elif abs(stamp_ns - self._frames_sent_ns) >= FRAMES_EVERY_NS:
+            self._frames_sent_ns = stamp_ns
             yield foxglove_messages.transforms((scanner,), stamp_ns)
 
     def _on_trail(self, message: FleetMessage, stamp_ns: int) -> Iterator[bytes]:

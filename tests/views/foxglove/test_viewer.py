@@ -15,7 +15,7 @@ from zbridge.views.foxglove.hub import Hub, Subscriber
 from zbridge.views.foxglove.replies import Service
 from zbridge.views.foxglove.requests import ClientChannel, PlaybackRequest
 from zbridge.views.foxglove.source import ViewerSource
-from zbridge.views.foxglove.viewer import CALLS, PUBLISHED, RATE_HZ, SEND_S, SUBSCRIPTIONS, TOLD_HZ, Overrun, Viewer
+from zbridge.views.foxglove.viewer import CALLS, PUBLISHED, RATE_HZ, SEND_S, SUBSCRIPTIONS, WARNINGS_HZ, Overrun, Viewer
 from zbridge.views.pictures import ViewerChannel
 from zbridge.views.schemas import Schema
 
@@ -273,7 +273,7 @@ async def test_a_refusal_of_the_source_and_a_spoiled_message_are_counted_and_end
 
 async def test_warnings_are_few_and_counts_are_not(scene: Scene) -> None:
     told = await scene.warned(*["{"] * 100)
-    assert TOLD_HZ <= len(told) < 2 * TOLD_HZ
+    assert WARNINGS_HZ <= len(told) < 2 * WARNINGS_HZ
     assert scene.counts == {"said": 100, "malformed": 100}
     await asyncio.sleep(1.0)
     assert await scene.warned("{") != []

@@ -28,7 +28,7 @@ def test_a_frame_knows_when_it_went_and_what_the_gateway_had_said(tmp_path: Path
     ]
     with files.written(tmp_path / "a.mcap", messages).open("rb") as file:
         read = list(steps(RecordingReader(file).messages(), KEYS, "robot"))
-    assert [(step.frame, round(step.at_s, 3), step.heard, step.datagram, step.answers) for step in read] == [
+    assert [(step.frame, round(step.at_s, 3), step.received, step.datagram, step.answers) for step in read] == [
         (b"a", 0.0, 0, False, True),
         (b"b", 0.2, 3, True, True),
         (b"c", late, 3, False, False),
@@ -50,7 +50,7 @@ def test_a_conversation_ends_where_the_link_is_no_longer_offline(tmp_path: Path)
     ]
     with files.written(tmp_path / "a.mcap", messages).open("rb") as file:
         read = list(steps(RecordingReader(file).messages(), KEYS, "robot"))
-    assert [(step.number, step.frame, step.heard) for step in read] == [
+    assert [(step.number, step.frame, step.received) for step in read] == [
         (1, b"a", 2),
         (1, b"b", 2),
         (1, b"c", 2),

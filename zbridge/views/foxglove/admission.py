@@ -75,7 +75,7 @@ class ViewerAdmission:
         return f"<ViewerAdmission {self._arrivals!r}>"
 
     def refusal(self, host: str, connections: int, now: float) -> str | None:
-        """Return why a connection is closed before it says anything, as one word; None if it may go on."""
+        """Return why a connection is closed before it sends anything, as one word; None if it may continue."""
         if self.policy.networks and not is_among(host, self.policy.networks):
             return "network"
         if not self._arrivals.admit(host, now):

@@ -1,7 +1,7 @@
 """The channels that viewers are offered, and who subscribed to which. Sans-IO.
 
-Work on demand: the source is told when the first viewer subscribes to a channel and when the last one leaves it, and
-publishes what is wanted only. The last message of a channel that keeps it is shown to whoever subscribes later.
+Work on demand: the source is notified when the first viewer subscribes to a channel and when the last one leaves it,
+and publishes what is wanted only. The last message of a channel that keeps it is shown to whoever subscribes later.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Subscriber(Protocol):
         """Tell the person something."""
 
     def parameters_changed(self, values: Mapping[str, Any]) -> None:
-        """Tell parameters, where the viewer watches them."""
+        """Send parameters, where the viewer watches them."""
 
 
 class _Offer:
@@ -68,7 +68,7 @@ class Hub:
         self.viewers: set[Subscriber] = set()
         self._offers: dict[int, _Offer] = {}
         self._by_topic: dict[str, _Offer] = {}
-        self._news: dict[str, str] = {}
+        self._warnings: dict[str, str] = {}
         self._next_id = 1
 
     def __repr__(self) -> str:
@@ -122,13 +122,13 @@ class Hub:
 
     def warn(self, name: str, text: str | None) -> None:
         """Show all viewers, those who come later too, what holds until it is called anew with the same name."""
-        if self._news.get(name) == text:
+        if self._warnings.get(name) == text:
             return
         if text is None:
-            del self._news[name]
+            del self._warnings[name]
             self.say(replies.remove_status([name]))
         else:
-            self._news[name] = text
+            self._warnings[name] = text
             self.say(replies.status(StatusLevel.WARNING, text, name))
 
     def parameters_changed(self, values: Mapping[str, Any]) -> None:
@@ -147,7 +147,7 @@ class Hub:
         self.viewers.add(viewer)
         if self._offers:
             viewer.say(replies.advertise(offer.entry for offer in self._offers.values()))
-        for name, text in self._news.items():
+        for name, text in self._warnings.items():
             viewer.say(replies.status(StatusLevel.WARNING, text, name))
 
     def leave(self, viewer: Subscriber) -> None:

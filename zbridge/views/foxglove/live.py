@@ -151,8 +151,8 @@ class LiveSource(ViewerSource):
             return
         control = read_payload(Control, sample.payload, self._malformed)
         if control is not None:
-            said = "; ".join(latch.described for latch in control.latches)
-            self.hub.warn(_latched(split[1]), f"{split[1]}: {said}" if said else None)
+            text = "; ".join(latch.described for latch in control.latches)
+            self.hub.warn(_latched(split[1]), f"{split[1]}: {text}" if text else None)
 
     def _found(self, shown: _Shown, path: str) -> None:
         if path not in shown.offered and shown.sensors < SENSORS:
@@ -174,12 +174,12 @@ class LiveSource(ViewerSource):
     def _subscribe(self, shown: _Shown, source: str) -> Handle:
         topic = topics.find(source)
         history = topic is not None and topic.qos.keeps_last
-        return self._bus.subscribe(shown.keys.key(source), lambda sample: self._take(shown, sample), history=history)
+        return self._bus.subscribe(shown.keys.key(source), lambda sample: self._receive(shown, sample), history=history)
 
     def _sources(self, channel: ViewerChannel) -> tuple[str, ...]:
         return (_ALL_SENSORS,) if channel.path == _SENSORS else sources_of(channel)
 
-    def _take(self, shown: _Shown, sample: Sample) -> None:
+    def _receive(self, shown: _Shown, sample: Sample) -> None:
         path = shown.keys.path(sample.key)
         topic = topics.find(path)
         if topic is None:

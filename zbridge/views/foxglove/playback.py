@@ -44,10 +44,10 @@ class Playback(ViewerSource):
         self._clock = PlaybackClock(recording.begin_ns, recording.end_ns)
         self._loop = asyncio.get_running_loop()
         self._changed = asyncio.Event()
-        self._look_back: set[str] = set()
+        self._backfill: set[str] = set()
         """Topics whose last message before now is to be shown."""
         self._from_ns: int | None = recording.begin_ns
-        """Where reading begins anew; None while it goes on."""
+        """Where reading begins anew; None while it continues."""
         hub.offer(recording.channels.values())
         hub.on_wanted = self._on_wanted
         hub.on_subscribed = self._on_subscribed
@@ -75,7 +75,7 @@ class Playback(ViewerSource):
             self._clock.speed = request.speed
         if sought:
             self._from_ns = self._clock.now_ns(now)
-            self._look_back.update(channel.topic for channel in self.hub.wanted())
+            self._backfill.update(channel.topic for channel in self.hub.wanted())
         viewer.say(self._state(sought=sought, request_id=request.request_id))
         others = self._state(sought=sought, request_id="")
         for other in self.hub.viewers:
@@ -85,7 +85,7 @@ class Playback(ViewerSource):
 
     def _on_wanted(self, channel: ViewerChannel, wanted: bool) -> None:
         if wanted:
-            self._look_back.add(channel.topic)
+            self._backfill.add(channel.topic)
             self._changed.set()
 
     def _on_subscribed(self, channel: ViewerChannel, viewer: Subscriber, subscription: int) -> None:
@@ -97,10 +97,10 @@ class Playback(ViewerSource):
         """Show messages when their time comes, until cancelled."""
         ahead: list[PlayedMessage] = []
         entries: Iterator[PlayedMessage] = iter(())
-        told_at = 0.0
+        sent_at = 0.0
         while True:
             self._changed.clear()
-            if self._look_back:
+            if self._backfill:
                 await self._show_last()
                 continue
             if self._from_ns is not None:  # what was recorded at this very time was shown as the last before it
@@ -115,12 +115,12 @@ class Playback(ViewerSource):
             while ahead and self._clock.playing and self._clock.wait_s(ahead[-1].log_ns, now) <= 0:
                 message = ahead.pop()
                 self.hub.publish(message.topic, message.log_ns, message.payload)
-            if self._clock.playing and now - told_at >= TICK_S:
-                told_at = now
-                self._tell_time(ended=not ahead)
-            await self._rest(ahead)
+            if self._clock.playing and now - sent_at >= TICK_S:
+                sent_at = now
+                self._send_time(ended=not ahead)
+            await self._wait(ahead)
 
-    async def _rest(self, ahead: list[PlayedMessage]) -> None:
+    async def _wait(self, ahead: list[PlayedMessage]) -> None:
         """Wait for the next message, the next tick, or a viewer."""
         wait_s: float | None = None
         if self._clock.playing:
@@ -136,7 +136,7 @@ class Playback(ViewerSource):
         if ahead and self._clock.playing and self._clock.wait_s(ahead[-1].log_ns, now) < -LATE_S:
             self._clock.seek(ahead[-1].log_ns, now)
 
-    def _tell_time(self, *, ended: bool) -> None:
+    def _send_time(self, *, ended: bool) -> None:
         now_ns = self._now_ns()
         self.hub.say(replies.time(now_ns))
         if ended and now_ns >= self._clock.end_ns:
@@ -145,7 +145,7 @@ class Playback(ViewerSource):
 
     async def _show_last(self) -> None:
         """Show the last messages before now of the channels that wait for them."""
-        topics, self._look_back = self._look_back, set()
+        topics, self._backfill = self._backfill, set()
         channels = self._recording.channels
         rare = {topic for topic in topics if channels[topic].schema.name in RARE}
         at_ns = self._now_ns()

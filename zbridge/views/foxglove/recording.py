@@ -123,7 +123,7 @@ class IndexedRecording:
             shown = ViewerChannel(channel.topic, channel.topic, Schema(name, kind, data, encoding))
             self.channels.setdefault(channel.topic, shown)
 
-    def _until_fault(self, file: IO[bytes], **wish: Any) -> Iterator[_Entry]:
+    def _until_fault(self, file: IO[bytes], **filters: Any) -> Iterator[_Entry]:
         """Yield entries up to what cannot be read. The order of times needs the index."""
         try:
             reader: McapReader
@@ -131,7 +131,7 @@ class IndexedRecording:
                 reader = SeekingReader(file, record_size_limit=RECORD_BYTES)
             else:
                 reader = NonSeekingReader(file, record_size_limit=RECORD_BYTES)
-            yield from reader.iter_messages(log_time_order=self.whole, **wish)
+            yield from reader.iter_messages(log_time_order=self.whole, **filters)
         except OSError:
             raise
         except Exception as error:  # whatever the library raises; a cut is the usual cause

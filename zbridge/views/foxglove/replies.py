@@ -1,4 +1,4 @@
-"""What the server says in ``foxglove.sdk.v1``: text messages as ``str``, binary ones as ``bytes``. Sans-IO."""
+"""What the server sends in ``foxglove.sdk.v1``: text messages as ``str``, binary ones as ``bytes``. Sans-IO."""
 
 from __future__ import annotations
 

@@ -182,7 +182,7 @@ class Front:
 
 
 class _Guarded(ServerConnection):
-    """A connection that is closed before it costs anything, if the admission says so.
+    """A connection that is closed before it costs anything, if the admission rejects it.
 
     It sends without a task where the socket takes it: each turn of the event loop less is a tenth of the latency.
     """

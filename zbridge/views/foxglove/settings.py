@@ -1,4 +1,4 @@
-"""What ``zbridge foxglove`` is told on its command line, checked as a whole before anything starts."""
+"""The options of ``zbridge foxglove``, checked as a whole before anything starts."""
 
 from __future__ import annotations
 

@@ -112,7 +112,7 @@ def export_arrays(path: Path, output: Path, selection: Selection) -> Export:
 def _chosen(path: Path, selection: Selection, done: Export) -> Iterator[RecordedMessage]:
     with open_recording(path) as file:
         reader = RecordingReader(file)
-        yield from filter(selection.takes, reader.messages())
+        yield from filter(selection.includes, reader.messages())
         done.fault = None if reader.ended else reader.fault
 
 

@@ -69,17 +69,17 @@ class Intake:
     def put(self, key: str, payload: bytes, attachment: bytes | None = None) -> bool:
         """Queue a message, from any thread; False where it was dropped. Arrival times rise along the queue."""
         size = len(payload) + (len(attachment) if attachment is not None else 0)
-        return self.put_seen(key, size, lambda: payload, attachment)
+        return self.put_sized(key, size, lambda: payload, attachment)
 
-    def put_seen(self, key: str, size: int, look: Callable[[], bytes], attachment: bytes | None) -> bool:
-        """Queue a message of ``size`` bytes, whose payload is looked at only where there is room for it."""
+    def put_sized(self, key: str, size: int, read_payload: Callable[[], bytes], attachment: bytes | None) -> bool:
+        """Queue a message of ``size`` bytes, whose payload is read only where there is room for it."""
         size += OVERHEAD_BYTES
         with self._lock:
             if self._bytes + size > self._bound:
                 self.dropped.add(key)
                 return False
             self._bytes += size
-            self._waiting.append(Arrival(self._clock_ns(), key, look(), attachment))
+            self._waiting.append(Arrival(self._clock_ns(), key, read_payload(), attachment))
         return True
 
     def take(self) -> list[Arrival]:

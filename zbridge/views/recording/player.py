@@ -1,7 +1,7 @@
 """Plays a recording: calls back with each message when it is due. A thread of its own, for it keeps time more exactly.
 
 Theory of operation. :class:`PlaybackClock` tells the time of the recording. The :class:`Player` reads one message after
-the other, sleeps until it is due, and hands it on. A message whose time is before the one that stands before it is due
+the other, sleeps until it is due, and hands it on. A message whose time is before that of its predecessor is due
 at once. A pause moves all that follows by its length.
 """
 
@@ -19,8 +19,8 @@ from zbridge.views.recording.selection import Selection
 
 log = logging.getLogger("zbridge.views.recording")
 
-NAP_S = 0.05
-"""Longest sleep between two looks at a pause or an end."""
+POLL_S = 0.05
+"""Longest sleep between two checks for a pause or an end."""
 
 
 class PlaybackClock:
@@ -42,7 +42,7 @@ class PlaybackClock:
 
     @property
     def ended(self) -> bool:
-        """Whether it rests at the end."""
+        """Whether it is paused at the end."""
         return not self.playing and self._at_ns >= self.end_ns
 
     def now_ns(self, now: float) -> int:
@@ -58,7 +58,7 @@ class PlaybackClock:
         self.playing, self.speed = True, speed
 
     def pause(self, now: float) -> None:
-        """Rest here."""
+        """Pause here."""
         self._set(self.now_ns(now), now)
         self.playing = False
 
@@ -77,7 +77,7 @@ class PlaybackClock:
 class Player:
     """Plays a file from :meth:`start` to its end or :meth:`close`. play: called on the player's thread.
 
-    ended: called there at the end, with what is wrong with the file, or None. skip: called with what stands before the
+    ended: called there at the end, with what is wrong with the file, or None. skip: called with what precedes the
     selected part.
     """
 
@@ -123,12 +123,12 @@ class Player:
         self._thread.start()
 
     def pause(self) -> None:
-        """Stand still until :meth:`resume`; from any thread."""
+        """Pause until :meth:`resume`; from any thread."""
         with self._lock:
             self._time.pause(self._clock())
 
     def resume(self) -> None:
-        """Go on; from any thread."""
+        """Continue; from any thread."""
         with self._lock:
             self._time.play(self._speed, self._clock())
 
@@ -159,7 +159,7 @@ class Player:
             for message in reader.messages():
                 if self._closing:
                     return None
-                if not self._selection.takes(message):
+                if not self._selection.includes(message):
                     if message.log_ns < self._selection.since_ns:
                         self._skip(message)
                     continue
@@ -179,7 +179,7 @@ class Player:
             with self._lock:
                 wait_s = math.inf if self.paused else self._time.wait_s(log_ns, self._clock())
             if wait_s > 0:
-                self._sleep(min(wait_s, NAP_S))
-            if wait_s <= NAP_S and not self.paused:  # another look at the clock would only make it late
+                self._sleep(min(wait_s, POLL_S))
+            if wait_s <= POLL_S and not self.paused:  # reading the clock again would only make it late
                 return not self._closing
         return False

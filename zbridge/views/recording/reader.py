@@ -3,7 +3,7 @@
 Theory of operation. The reader never seeks and never trusts the summary at the end of a file. Records are framed by
 their length, which is checked before anything is read; their contents are read within the record. A chunk is
 decompressed to the size that it states, within :data:`CHUNK_BYTES`, and its checksum is compared. The first byte that
-cannot be understood ends the file: what stands before it was read, and :attr:`Reader.fault` says what is wrong.
+cannot be understood ends the file: what precedes it was read, and :attr:`RecordingReader.fault` names the damage.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ class RecordingReader:
             elif opcode == _MESSAGE_OP:
                 yield self._message(memoryview(content))
             else:
-                self._take(opcode, memoryview(content))
+                self._read_record(opcode, memoryview(content))
 
     def _inner(self, data: bytes) -> Iterator[RecordedMessage]:
         """Yield the messages of a chunk."""
@@ -134,7 +134,7 @@ class RecordingReader:
             if opcode == _MESSAGE_OP:
                 yield self._message(content)
             else:
-                self._take(opcode, content)
+                self._read_record(opcode, content)
 
     def _message(self, content: memoryview) -> RecordedMessage:
         if len(content) < _MESSAGE.size:
@@ -145,7 +145,7 @@ class RecordingReader:
             raise BrokenError(f"a message of channel {number}, which was not declared")
         return RecordedMessage(channel, log_ns, publish_ns, sequence, bytes(content[_MESSAGE.size :]))
 
-    def _take(self, opcode: int, content: memoryview) -> None:
+    def _read_record(self, opcode: int, content: memoryview) -> None:
         """Take a record that is no message; others than those known are skipped."""
         read = _RECORDS.get(opcode)
         if read is not None:

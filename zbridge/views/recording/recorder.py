@@ -2,7 +2,7 @@
 
 Theory of operation. Every :data:`PAUSE_S` the thread takes all that waits in the intake. A message goes to the channel
 of its key as it was; a command is followed by its sender; a message that has a picture by its pictures. Log time is the
-time of arrival, publish time the message's ``stamp_ns``. A disk that takes nothing more ends the recording: the files
+time of arrival, publish time the message's ``stamp_ns``. A disk that is full ends the recording: the files
 are ended with what they hold, ``error`` says why, and what still arrives is counted as lost.
 """
 
@@ -28,7 +28,7 @@ from zbridge.views.recording.tape import CHANNELS, Tape
 log = logging.getLogger("zbridge.views.recording")
 
 PAUSE_S = 0.05
-"""Seconds between two looks at the intake."""
+"""Seconds between two reads of the intake."""
 ROBOTS = 4096
 """Most robots whose leases, states and descriptions are followed."""
 STATES = 16_384
@@ -144,7 +144,7 @@ class Recorder:
 
     def _work(self) -> None:
         while True:
-            ending = self._ending.wait(PAUSE_S)  # looked at first: what came before it is still written
+            ending = self._ending.wait(PAUSE_S)  # read first: what came before it is still written
             batch = self._intake.take()
             self._write_batch(batch)
             if ending:

@@ -35,7 +35,7 @@ from zbridge.views.recording.wire_tape import wire_links
 
 CLAIM_S = 5.0
 """Longest time until the name of a replayed robot is claimed."""
-LOOKED_AT = 200_000
+SURVEYED = 200_000
 """Messages at the begin of a file that are looked through for robots."""
 SUFFIX = "-replay"
 
@@ -68,7 +68,7 @@ def survey(path: Path) -> Survey:
     statuses: dict[str, Status] = {}
     with open_recording(path) as file:
         reader = RecordingReader(file)
-        for _, message in zip(range(LOOKED_AT), reader.messages(), strict=False):
+        for _, message in zip(range(SURVEYED), reader.messages(), strict=False):
             topic = message.channel.topic
             if message.channel.encoding == MSGPACK or is_wire(topic):
                 keys.add(topic)
@@ -129,7 +129,7 @@ def plan_listeners(wanted: Sequence[str]) -> tuple[ListenerPlan, ...]:
 class Replay:
     """One replay on a bus. :meth:`run` returns at its end."""
 
-    def __init__(self, bus: Bus, plan: ReplayPlan, told: Callable[[str], object] = lambda text: None) -> None:
+    def __init__(self, bus: Bus, plan: ReplayPlan, report: Callable[[str], object] = lambda text: None) -> None:
         self.fault: str | None = None
         """What is wrong with the file."""
         self.played = self.left_out = 0
@@ -138,7 +138,7 @@ class Replay:
         self.robots: dict[str, ReplayedRobot] = {}
         self._bus = bus
         self._plan = plan
-        self._told = told
+        self._report = report
         self._ended = asyncio.Event()
         self._loop = asyncio.get_running_loop()
         self._earlier: dict[str, RecordedMessage] = {}
@@ -255,15 +255,15 @@ class Replay:
             shown.close()
 
     async def _listen(self, listener: Listener) -> None:
-        async def tell() -> None:
+        async def report_ready() -> None:
             await listener.ready.wait()
-            self._told(f"HQ programs connect at {listener.address}")
+            self._report(f"HQ programs connect at {listener.address}")
 
-        telling = asyncio.ensure_future(tell())
+        reporting = asyncio.ensure_future(report_ready())
         try:
             await listener.run()
         finally:
-            telling.cancel()
+            reporting.cancel()
 
 
 class AsRecorded:

@@ -54,7 +54,7 @@ class Selection(msgspec.Struct, frozen=True):
     since_ns: int = 0
     until_ns: int = _LAST_NS
 
-    def takes(self, message: RecordedMessage) -> bool:
+    def includes(self, message: RecordedMessage) -> bool:
         """Tell whether a message is chosen."""
         if not self.since_ns <= message.log_ns < self.until_ns:
             return False

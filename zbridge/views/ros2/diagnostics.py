@@ -27,7 +27,7 @@ class Diagnostic(msgspec.Struct, frozen=True):
 
 
 def entries_of(robot: str, status: Status | None, control: Control | None) -> list[Diagnostic]:
-    """Return the entries of a robot's state, links, control and refusals, as its gateway tells them."""
+    """Return the entries of a robot's state, links, control and refusals, as its gateway reports them."""
     return [_state(robot, status), _links(robot, status), _control(robot, control), _refusals(robot, control)]
 
 
@@ -35,8 +35,8 @@ def _state(robot: str, status: Status | None) -> Diagnostic:
     name = f"{robot}: state"
     if status is None:
         return Diagnostic(STALE, name, "no gateway tells")
-    told = (("protocol", status.protocol), ("dialect", status.dialect), ("version", status.version))
-    values = [(key, value) for key, value in told if value]
+    facts = (("protocol", status.protocol), ("dialect", status.dialect), ("version", status.version))
+    values = [(key, value) for key, value in facts if value]
     if status.features:
         values.append(("features", ", ".join(status.features)))
     text = status.state + (f": {status.reason}" if status.reason else "")

@@ -34,7 +34,7 @@ _FIXED = frozenset(topic.name for topic in TOPICS)
 class RobotNode:
     """Declares a robot on ROS's side. bus: the fleet's; own: our name there, if a certificate says one.
 
-    drive: whether cmd_vel is heard.
+    drive: whether cmd_vel is subscribed to.
     """
 
     def __init__(
@@ -97,13 +97,13 @@ class RobotNode:
         def listened(anybody: bool) -> None:
             self._on_listened(topic.name, made[0], anybody)
 
-        made.append(Outlet(self._side, endpoint, listened, kept=topic.qos.depth if topic.kept else 0))
+        made.append(Outlet(self._side, endpoint, listened, kept=topic.qos.depth if topic.latched else 0))
         return made[0]
 
     # On demand
 
     def _on_listened(self, name: str, outlet: Outlet, anybody: bool) -> None:
-        if self._closed or outlet not in self._outlets.get(name, ()):  # it was told of before it was closed
+        if self._closed or outlet not in self._outlets.get(name, ()):  # it was message of before it was closed
             return
         with self._lock:
             listened = self._listened.setdefault(name, set())
@@ -121,17 +121,17 @@ class RobotNode:
 
     def _subscribe_to(self, path: str) -> Handle:
         topic = topics.find(path) if is_concrete(path) else None
-        handler = partial(self._take, path, topic) if topic is not None else self._take_any
+        handler = partial(self._receive, path, topic) if topic is not None else self._receive_any
         history = topic is not None and topic.qos.keeps_last
         return self._bus.subscribe(self._keys.key(path), handler, history=history, direct=not history)
 
-    def _take_any(self, sample: Sample) -> None:
+    def _receive_any(self, sample: Sample) -> None:
         path = self._keys.path(sample.key)
         topic = topics.find(path)
         if topic is not None:
-            self._take(path, topic, sample)
+            self._receive(path, topic, sample)
 
-    def _take(self, path: str, topic: Topic, sample: Sample) -> None:
+    def _receive(self, path: str, topic: Topic, sample: Sample) -> None:
         message: FleetMessage | None = read_payload(
             topic.message, sample.payload, self._malformed, arrays=topic is not topics.SCAN
         )
@@ -157,9 +157,9 @@ class RobotNode:
         self._drop_sensors({topic.name for topic in sensors})
         self._declare(sensors)
 
-    def _drop_sensors(self, kept: set[str]) -> None:
+    def _drop_sensors(self, present: set[str]) -> None:
         """Take back the topics of sensors that the robot has no more."""
-        for name in self._outlets.keys() - kept - _FIXED:
+        for name in self._outlets.keys() - present - _FIXED:
             for outlet in self._outlets.pop(name):
                 outlet.close()
             with self._lock:
@@ -176,8 +176,8 @@ class RobotNode:
         if outlets:
             more = [self.teleop.diagnostics()] if self.teleop is not None else []
             with self._lock:
-                told = self._pictures.diagnostics(more, time.time_ns())
-            self._publish(told, outlets)
+                message = self._pictures.diagnostics(more, time.time_ns())
+            self._publish(message, outlets)
             self._timer = asyncio.get_running_loop().call_later(DIAGNOSED_S, self._diagnose)
 
     def _on_stop(self) -> None:

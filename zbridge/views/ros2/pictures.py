@@ -91,7 +91,7 @@ class RosTopic(msgspec.Struct, frozen=True):
     everywhere: bool = False
 
     @property
-    def kept(self) -> bool:
+    def latched(self) -> bool:
         """Whether who comes late gets the last message."""
         return self.qos == LATCHED
 

@@ -1,4 +1,4 @@
-"""What ``zbridge ros2`` is told on its command line and in its file, checked as a whole before anything starts."""
+"""The settings of ``zbridge ros2``, checked as a whole before anything starts."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ class Mount(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class RobotBody(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What ROS has to know of a robot, and no robot of ours tells.
+    """What ROS has to know of a robot, and robots do not report.
 
     speed_full_mps, turn_full_radps: its speeds at full scale. wheelbase_m: of a robot that steers, between its axles;
-    None: it turns on the spot. steer_full_rad: how far its wheels turn at full lock; an ALF vehicle is told 90 degrees
+    None: it turns on the spot. steer_full_rad: how far its wheels turn at full lock; an ALF vehicle gets 90 degrees
     then. length_m, width_m, height_m: what RViz shows. sensors: where those of these names are, and the ``camera``; of
     others no frame is told. map_to_odom: tell ROS that odometry begins at the map's origin; false where a program of
     ROS's, as slam_toolbox, tells it.

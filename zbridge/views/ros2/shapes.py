@@ -30,7 +30,7 @@ TURN_VARIANCE = 0.05**2
 UNMEASURED = 1e6
 """The variance of what nobody measured."""
 _NO_ESTIMATE = -1.0
-"""In the first place of an Imu's covariance: this part is not given."""
+"""In the first place of an Imu's covariance: this part is not known."""
 _ORIGIN, _NOTHING = Pose(0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 _SECOND_NS = 1_000_000_000
 _CELLS = np.array([-1, 0, 100] + [-1] * 253, np.int8)
@@ -169,8 +169,8 @@ class Shapes:
         gyro, acceleration = motion.gyro, motion.acceleration
         if gyro is None and acceleration is None:
             return None
-        given = tuple(0.0 if vector is not None else _NO_ESTIMATE for vector in (gyro, acceleration))
-        return self._imu_form.fill(stamp_ns, *(gyro or _NOTHING), *(acceleration or _NOTHING), *given)
+        known = tuple(0.0 if vector is not None else _NO_ESTIMATE for vector in (gyro, acceleration))
+        return self._imu_form.fill(stamp_ns, *(gyro or _NOTHING), *(acceleration or _NOTHING), *known)
 
     @cached_property
     def _imu_form(self) -> MessageTemplate:
@@ -194,13 +194,13 @@ class Shapes:
         return self._make(
             "sensor_msgs/msg/BatteryState",
             header=self.header(stamp_ns, self.frames.base),
-            voltage=_told(battery.voltage),
+            voltage=_or_nan(battery.voltage),
             temperature=math.nan,
-            current=_told(battery.current),
+            current=_or_nan(battery.current),
             charge=math.nan,
             capacity=math.nan,
             design_capacity=math.nan,
-            percentage=_told(battery.level),
+            percentage=_or_nan(battery.level),
             power_supply_status=status,
             present=True,
         )
@@ -292,7 +292,7 @@ def _between_s(count: int, scan: Scan, scanner: Scanner | None, period_s: float)
     return between_s if 0.0 < between_s * (count - 1) <= longest_s else 0.0
 
 
-def _told(value: float | None) -> float:
+def _or_nan(value: float | None) -> float:
     return math.nan if value is None else value
 
 

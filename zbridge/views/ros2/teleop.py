@@ -4,7 +4,7 @@ Theory of operation. A liveliness watch knows the publishers by their tokens, an
 Zenoh loses the news of some tokens while many come and go at once: they are asked for again, at most every
 :data:`ASK_S`, where somebody unknown commands or there is no place for another publisher.
 :meth:`Teleop._sort` runs on Zenoh's threads: it drops what no known publisher sent, and what comes faster than
-:data:`RATE_HZ`, before the event loop hears of it. The rest is read (``cmd_vel``), and carried out by ``holder``.
+:data:`RATE_HZ`, before the event loop receives it. The rest is read (``cmd_vel``), and carried out by ``holder``.
 """
 
 from __future__ import annotations
@@ -188,7 +188,7 @@ class Teleop:
                 self._on_token(token, True, late=True)
 
     def _watch_control(self, wanted: bool) -> None:
-        """Look who stops the robot, while there is a publisher."""
+        """Watch who stops the robot, while there is a publisher."""
         if wanted and self._control is None:
             self._stopped = None
             self._control = self._fleet.subscribe(self._control_key, self._on_control)

@@ -142,43 +142,41 @@ def _summary(robots: dict[str, Status | None]) -> str:
     return f"{len(robots)} robots: " + ", ".join(f"{count} {state}" for state, count in counts.most_common())
 
 
-class EchoOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """What ``zbridge echo`` prints. realm: None takes that of the key. count, seconds: end after so many, 0 = never."""
+async def echo(
+    settings: BusSettings,
+    key: str,
+    *,
+    realm: str | None = None,
+    as_json: bool = False,
+    count: int = 0,
+    seconds: float = 0.0,
+) -> bool:
+    """Print the messages on a key, the last value of each state first. realm: None takes that of the key.
 
-    key: str
-    realm: str | None = None
-    as_json: bool = False
-    count: int = 0
-    seconds: float = 0.0
-
-
-async def echo(settings: BusSettings, options: EchoOptions) -> bool:
-    """Print the messages on a key, the last value of each state first.
-
-    Return False if ``seconds`` passed with fewer messages than ``count``, or with none. Raise ConfigError for what is
-    no key expression, or none of the realm.
+    count, seconds: end after so many, 0 = never. Return False if ``seconds`` passed with fewer messages than ``count``,
+    or with none. Raise ConfigError for what is no key expression, or none of the realm.
     """
-    key = read_key_expr("KEY", options.key)
-    count, seen, done = options.count, 0, asyncio.Event()
-    realm = _realm_of(key, options.realm)
+    key = read_key_expr("KEY", key)
+    seen, done = 0, asyncio.Event()
+    realm = _realm_of(key, realm)
 
     def show(sample: Sample) -> None:
         nonlocal seen
         if count and seen >= count:
             return
         seen += 1
-        console.print(_line(sample, as_json=options.as_json))
+        console.print(_line(sample, as_json=as_json))
         if seen == count:
             done.set()
 
     async with joined(settings, realm) as bus:
         bus.subscribe(key, show, history=True)
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(options.seconds or None):
+            async with asyncio.timeout(seconds or None):
                 await done.wait()
     if seen and seen >= count:
         return True
-    errors.print(shown(f"{seen or 'no'} messages on {key} within {options.seconds:g} s"))
+    errors.print(shown(f"{seen or 'no'} messages on {key} within {seconds:g} s"))
     return False
 
 

@@ -126,8 +126,9 @@ def echo(
     from zbridge.cli import bus
 
     set_up_log(verbose=False, level=logging.ERROR)
-    options = bus.EchoOptions(key=key, realm=realm or None, as_json=json, count=count, seconds=seconds)
-    if run_loop(until_signal(bus.echo(bus_settings(connect, tls), options))) is False:
+    settings = bus_settings(connect, tls)
+    work = bus.echo(settings, key, realm=realm or None, as_json=json, count=count, seconds=seconds)
+    if run_loop(until_signal(work)) is False:
         raise typer.Exit(1)
 
 

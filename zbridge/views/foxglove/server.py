@@ -21,7 +21,7 @@ from websockets.protocol import State
 from websockets.typing import Subprotocol
 
 from zbridge.app.prometheus import serve_metrics
-from zbridge.bus import Bus, BusSettings, open_bus
+from zbridge.bus import BusSettings, open_bus
 from zbridge.client import Fleet
 from zbridge.errors import ConfigError
 from zbridge.fleet.printable import shown
@@ -240,24 +240,15 @@ async def serve_live(
     plan: FoxglovePlan, bus: BusSettings, realm: str, metrics: Metrics, on_ready: Callable[[Front], None]
 ) -> None:
     """Serve the robots of a realm; raise BusError or ConfigError. on_ready: called when viewers are accepted."""
-    joined = await open_bus(bus, metrics, wait_for_peers=True)
-    try:
-        await _serve_bus(plan, joined, realm, metrics, on_ready)
-    finally:
-        await joined.close()
-
-
-async def _serve_bus(
-    plan: FoxglovePlan, bus: Bus, realm: str, metrics: Metrics, on_ready: Callable[[Front], None]
-) -> None:
-    hub = Hub()
-    commands = RobotCommands(hub, Fleet(bus, realm), plan.scales, plan.policy.who)
-    live = LiveSource(hub, bus, realm, plan.robots, commands, metrics)
-    live.start()
-    try:
+    async with contextlib.AsyncExitStack() as stack:
+        joined = await open_bus(bus, metrics, wait_for_peers=True)
+        stack.push_async_callback(joined.close)
+        hub = Hub()
+        commands = RobotCommands(hub, Fleet(joined, realm), plan.scales, plan.policy.who)
+        live = LiveSource(hub, joined, realm, plan.robots, commands, metrics)
+        stack.push_async_callback(live.close)
+        live.start()
         await _serve(plan, live, metrics, on_ready)
-    finally:
-        await live.close()
 
 
 async def serve_file(plan: FoxglovePlan, file: Path, metrics: Metrics, on_ready: Callable[[Front], None]) -> None:

@@ -81,11 +81,6 @@ def is_wire(key: str) -> bool:
     return "/@wire/" in key
 
 
-def is_command(key: str) -> bool:
-    """Tell whether commands travel on a key."""
-    return "/@cmd/" in key
-
-
 def channel_of(key: str, *, datagram: bool = False) -> ChannelKind:
     """Describe the channel of a key."""
     if is_wire(key):

@@ -21,7 +21,7 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, Status
 from zbridge.fleet.topics import Delivery, Topic, split_key
-from zbridge.views.recording.contents import SENT, ChannelKind, Pictures, Sent, channel_of, is_command, read_sender
+from zbridge.views.recording.contents import SENT, ChannelKind, Pictures, Sent, channel_of, read_sender
 from zbridge.views.recording.intake import Arrival, Intake, Losses
 from zbridge.views.recording.tape import CHANNELS, Tape
 
@@ -128,7 +128,7 @@ class Recorder:
             "too many channels": self.refused,
             "missing in the sequence": self.missing,
         }
-        return {reason: dict(losses.by_key) for reason, losses in reasons.items() if losses.total}
+        return {reason: dict(losses) for reason, losses in reasons.items() if losses}
 
     # The thread
 
@@ -250,7 +250,7 @@ class Recorder:
         return track
 
     def _write_sender(self, arrival: Arrival, publish_ns: int) -> None:
-        if not (self._fleet and is_command(arrival.key)):
+        if not (self._fleet and "/@cmd/" in arrival.key):
             return
         lease = read_sender(arrival.attachment)
         holders: Mapping[bytes, str] = self._holders.get(arrival.key.partition("/@cmd/")[0], {})

@@ -158,10 +158,9 @@ class Replay:
             watching = []
             for recorded, name in self._plan.names.items():
                 ownership = await stack.enter_async_context(self._claimed(name))
-                robot = self.robots[recorded] = ReplayedRobot(
-                    self._bus, KeySpace(self._plan.realm, name), f"a recording of {recorded}"
-                )
-                robot.begin(self._plan.statuses.get(recorded))
+                keys, status = KeySpace(self._plan.realm, name), self._plan.statuses.get(recorded)
+                robot = ReplayedRobot(self._bus, keys, f"a recording of {recorded}", status)
+                self.robots[recorded] = robot
                 robot.open()
                 stack.callback(robot.close)
                 watching.append(self._watch(ownership, name))

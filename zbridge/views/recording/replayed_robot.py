@@ -41,9 +41,16 @@ _LEASE = ("acquire/*", "takeover/*", "renew", "release", "unlatch/*", "unlatch_f
 
 
 class ReplayedRobot:
-    """Publishes what a recording has of one robot. reason: shown by ``status``."""
+    """Publishes what a recording has of one robot. reason: shown by ``status``; status: shown until one is played."""
 
-    def __init__(self, bus: Bus, keys: KeySpace, reason: str, clock_ns: Callable[[], int] = time.time_ns) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        keys: KeySpace,
+        reason: str,
+        status: Status | None = None,
+        clock_ns: Callable[[], int] = time.time_ns,
+    ) -> None:
         self.recorded_protocol: str | None = None
         """The robot's own protocol, as its last status said."""
         self.unplayed = 0
@@ -65,14 +72,11 @@ class ReplayedRobot:
         self._handles: list[Handle] = []
         self._repeating: asyncio.Task[None] | None = None
         self._control_due: asyncio.TimerHandle | None = None
+        if status is not None:
+            self._note_status(status)
 
     def __repr__(self) -> str:
         return f"<ReplayedRobot {self._keys.robot}>"
-
-    def begin(self, status: Status | None) -> None:
-        """Show this status of the recording until it is played."""
-        if status is not None:
-            self._note_status(status)
 
     def open(self) -> None:
         """Appear on the bus, and refuse commands from now on."""

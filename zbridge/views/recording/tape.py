@@ -74,47 +74,39 @@ class OutputFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._descriptor = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_CLOEXEC, 0o644)
-        self._pending = bytearray()
-        self._written = 0
+        self.pending = bytearray()
+        """Gathered for the next flush."""
+        self.written = 0
+        """Bytes that are in the file."""
 
     def __repr__(self) -> str:
         return f"<OutputFile {self.path} {self.tell()} bytes>"
 
-    @property
-    def pending(self) -> bool:
-        """Whether there is something to flush."""
-        return bool(self._pending)
-
-    @property
-    def written(self) -> int:
-        """Bytes that are in the file."""
-        return self._written
-
     def write(self, data: Any) -> int:
         """Gather bytes for the next flush."""
-        self._pending += data
+        self.pending += data
         return len(data)
 
     def tell(self) -> int:
         """Return the size of the file with all that was gathered."""
-        return self._written + len(self._pending)
+        return self.written + len(self.pending)
 
     def flush(self) -> None:
         """Write what was gathered; raise OSError where not all of it could be written."""
-        view = memoryview(self._pending)
+        view = memoryview(self.pending)
         done = 0
         while done < len(view):
             done += os.write(self._descriptor, view[done:])
         view.release()
-        self._written += done
-        self._pending = bytearray()
+        self.written += done
+        self.pending = bytearray()
 
     def cut(self, size: int) -> None:
         """Forget what was gathered, and all that was written behind ``size``."""
-        self._pending = bytearray()
+        self.pending = bytearray()
         os.ftruncate(self._descriptor, size)
         os.lseek(self._descriptor, size, os.SEEK_SET)
-        self._written = size
+        self.written = size
 
     def close(self) -> None:
         """Close the file; idempotent."""

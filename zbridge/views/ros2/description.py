@@ -2,41 +2,24 @@
 
 from __future__ import annotations
 
-import msgspec
-
 from zbridge.ros2 import ros_name
 from zbridge.views.ros2.settings import RobotBody
 
 
-class Frames(msgspec.Struct, frozen=True):
-    """The names of one robot's frames. prefix: the robot, as a part of a ROS name."""
+class Frames:
+    """The names of one robot's frames. prefix: the robot, as a part of a ROS name.
 
-    prefix: str
+    odom: where odometry counts from; base: the robot, on the ground; laser: the scanner.
+    """
 
-    @property
-    def map(self) -> str:
-        """The robot's map."""
-        return f"{self.prefix}/map"
+    def __init__(self, prefix: str) -> None:
+        self.prefix = prefix
+        self.map, self.odom = f"{prefix}/map", f"{prefix}/odom"
+        self.camera, self.laser = f"{prefix}/camera", f"{prefix}/laser"
+        self.base = f"{prefix}/base_link"
 
-    @property
-    def odom(self) -> str:
-        """Where odometry counts from."""
-        return f"{self.prefix}/odom"
-
-    @property
-    def base(self) -> str:
-        """The robot, on the ground."""
-        return f"{self.prefix}/base_link"
-
-    @property
-    def camera(self) -> str:
-        """The camera."""
-        return f"{self.prefix}/camera"
-
-    @property
-    def laser(self) -> str:
-        """The scanner."""
-        return f"{self.prefix}/laser"
+    def __repr__(self) -> str:
+        return f"<Frames of {self.prefix}>"
 
     def sensor(self, name: str) -> str:
         """Name the frame of a sensor."""

@@ -27,26 +27,21 @@ HIDDEN_AFTER_S = 2.0
 async def serve(plan: Ros2Plan, bus: BusSettings, metrics: Metrics, on_ready: Callable[[View], None]) -> None:
     """Show robots until cancelled; raise BusError or ConfigError. on_ready: called when robots are looked for."""
     types = types_of(plan.distro)
-    fleet = await open_bus(bus, metrics, wait_for_peers=True, realm=plan.realm, threads=False)
-    try:
+    async with contextlib.AsyncExitStack() as stack:
+        fleet = await open_bus(bus, metrics, wait_for_peers=True, realm=plan.realm, threads=False)
+        stack.push_async_callback(fleet.close)
         try:
             ros = await open_bus(plan.ros, metrics, timestamps=True, threads=False)
         except BusError as error:
             where = ", ".join(plan.ros.connect)
             raise BusError(f"{error}: no ROS router at {where}: `ros2 run rmw_zenoh_cpp rmw_zenohd`") from error
-        try:
-            _apart(fleet, ros, plan)
-            view = View(plan, fleet, RosSide(ros, plan.domain, types, metrics), own_name(bus.tls))
-            try:
-                view.start()
-                on_ready(view)
-                await asyncio.Event().wait()
-            finally:
-                await view.close()
-        finally:
-            await ros.close()
-    finally:
-        await fleet.close()
+        stack.push_async_callback(ros.close)
+        _apart(fleet, ros, plan)
+        view = View(plan, fleet, RosSide(ros, plan.domain, types, metrics), own_name(bus.tls))
+        stack.push_async_callback(view.close)
+        view.start()
+        on_ready(view)
+        await asyncio.Event().wait()
 
 
 def _apart(fleet: Bus, ros: Bus, plan: Ros2Plan) -> None:

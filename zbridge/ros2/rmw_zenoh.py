@@ -101,28 +101,17 @@ def read_qos(text: str) -> RosQoS | None:
     history, comma, depth = parts[2].partition(",")
     if not comma:
         return None
-    reliability, durability = _RELIABILITIES.get(parts[0]), _DURABILITIES.get(parts[1])
-    if reliability is None or durability is None or history not in ("", "0", "1", "2", "3"):
+    if any(policy not in _POLICIES for policy in (parts[0], parts[1], history)):
         return None
+    reliability = Reliability.BEST_EFFORT if parts[0] == "2" else Reliability.RELIABLE
+    durability = Durability.TRANSIENT_LOCAL if parts[1] == "1" else Durability.VOLATILE
     if depth and not (depth.isascii() and depth.isdigit() and len(depth) < 19):
         return None
     return RosQoS(reliability, durability, 0 if history == "2" else int(depth or _DEFAULT_DEPTH))
 
 
-_RELIABILITIES = {
-    "": Reliability.RELIABLE,
-    "0": Reliability.RELIABLE,
-    "1": Reliability.RELIABLE,
-    "2": Reliability.BEST_EFFORT,
-    "3": Reliability.RELIABLE,
-}
-_DURABILITIES = {
-    "": Durability.VOLATILE,
-    "0": Durability.VOLATILE,
-    "1": Durability.TRANSIENT_LOCAL,
-    "2": Durability.VOLATILE,
-    "3": Durability.VOLATILE,
-}
+_POLICIES = ("", "0", "1", "2", "3")
+"""The policies that rmw knows, by number; empty: its default."""
 KEEP_LAST_10 = RosQoS()
 SENSOR_DATA = RosQoS(Reliability.BEST_EFFORT, depth=5)
 """rmw_qos_profile_sensor_data."""

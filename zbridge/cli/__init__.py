@@ -34,6 +34,7 @@ from zbridge.errors import ConfigError, ZbridgeError
 from zbridge.fleet.printable import shown
 
 if TYPE_CHECKING:  # loaded where there is a supervisor only
+    from zbridge.app.config import Plan
     from zbridge.app.supervisor.child import Reporter
 
 
@@ -89,10 +90,8 @@ def run_gateway(
         set_up_log(verbose=verbose)
     plan = load(file, tls=tls, content=content)
     hand_on_tls(tls)
-    parts = {"device": plan.device} if plan.device else {f"hq[{n}]": part for n, part in enumerate(plan.listeners)}
-    for key, part in parts.items():
-        if only is not None and part.protocol.name != only:
-            raise ConfigError(f"{file}: {key}.protocol = {part.protocol.name!r}: expected {only!r}")
+    if only is not None:
+        _require_protocol(plan, file, only)
     try:
         check_member(plan)
     except ConfigError as error:
@@ -118,7 +117,19 @@ def run_gateway(
         raise ConfigError(f"{file}: {error}") from error
     if gateway.restarts.gone.is_set() and isinstance(successor, Spawn):
         successor.tell_systemd()
-    if not gateway.left:  # a thread of the bus hangs and would keep the process alive
+    _exit(left=gateway.left)
+
+
+def _require_protocol(plan: Plan, file: Path, only: str) -> None:
+    parts = {"device": plan.device} if plan.device else {f"hq[{n}]": part for n, part in enumerate(plan.listeners)}
+    for key, part in parts.items():
+        if part.protocol.name != only:
+            raise ConfigError(f"{file}: {key}.protocol = {part.protocol.name!r}: expected {only!r}")
+
+
+def _exit(*, left: bool) -> None:
+    """End the process where the bus was not left: one of its threads hangs and would keep the process alive."""
+    if not left:
         logging.shutdown()
         os._exit(0)
 
@@ -149,9 +160,7 @@ def run_together(files: Sequence[Path], host: HostSettings, *, verbose: bool = F
     gc.freeze()
     together = Together({plan.config.robot.name: plan for _, plan in plans}, host)
     run_loop(until_signal(together.run()))
-    if not together.left:
-        logging.shutdown()
-        os._exit(0)
+    _exit(left=together.left)
 
 
 def run_loop(work: Coroutine[Any, Any, Any]) -> Any:

@@ -17,6 +17,27 @@ app = typer.Typer()
 Recorded = Annotated[Path, typer.Argument(help="a recording (MCAP)", show_default=False)]
 Since = Annotated[str, typer.Option("--from", help="begin here: 12.5, 1:30, or a time of day: 2026-11-22T05:00:00")]
 Until = Annotated[str, typer.Option("--to", help="end here; written as --from")]
+NewNames = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="the new name; of several robots RECORDED=NEW for each. By default all, as NAME-replay; "
+        "with --as-robot: which robot of the recording"
+    ),
+]
+HqListeners = Annotated[
+    list[str] | None,
+    typer.Option(help="serve old HQ programs: PROTOCOL:PORT, PROTOCOL:HOST:PORT or a file with [[hq]]"),
+]
+AsRobot = Annotated[
+    str, typer.Option("--as-robot", help="be the legacy robot itself, from its raw frames; the protocol's name")
+]
+Listen = Annotated[
+    list[str] | None, typer.Option(help="where the legacy robot listens, tcp://host:port; once for each link")
+]
+Configurations = Annotated[
+    list[Path] | None,
+    typer.Option(help="a gateway's configuration, to be kept in the recording without its secrets"),
+]
 
 
 @app.command()
@@ -31,10 +52,7 @@ def record(
     keep: Annotated[int, typer.Option(help="keep the last N files; with --split", min=0)] = 0,
     duration: Annotated[str, typer.Option(help="end after this time: 90s, 10min, 1h")] = "",
     compression: Annotated[str, typer.Option(help="zstd, lz4 or none")] = "zstd",
-    config: Annotated[
-        list[Path] | None,
-        typer.Option(help="a gateway's configuration, to be kept in the recording without its secrets"),
-    ] = None,
+    config: Configurations = None,
     buffer: Annotated[str, typer.Option(help="how much may wait for a slow disk")] = "64MiB",
     connect: Connect = [],  # noqa: B006
     tls: TlsFolder = None,
@@ -115,28 +133,15 @@ def mark(
 @app.command()
 def replay(
     file: Recorded,
-    robot: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="the new name; of several robots RECORDED=NEW for each. By default all, as NAME-replay; "
-            "with --as-robot: which robot of the recording"
-        ),
-    ] = None,
+    robot: NewNames = None,
     speed: Annotated[float, typer.Option(help="seconds of the recording per second", min=0.01, max=1000.0)] = 1.0,
     loop: Annotated[bool, typer.Option("--loop", help="begin anew at the end")] = False,
     since: Since = "",
     until: Until = "",
     pause: Annotated[bool, typer.Option("--pause", help="wait; Enter goes on, and pauses again")] = False,
-    hq: Annotated[
-        list[str] | None,
-        typer.Option(help="serve old HQ programs: PROTOCOL:PORT, PROTOCOL:HOST:PORT or a file with [[hq]]"),
-    ] = None,
-    as_robot: Annotated[
-        str, typer.Option("--as-robot", help="be the legacy robot itself, from its raw frames; the protocol's name")
-    ] = "",
-    listen: Annotated[
-        list[str] | None, typer.Option(help="where the legacy robot listens, tcp://host:port; once for each link")
-    ] = None,
+    hq: HqListeners = None,
+    as_robot: AsRobot = "",
+    listen: Listen = None,
     connect: Connect = [],  # noqa: B006
     tls: TlsFolder = None,
     realm: Realm = "fleet",

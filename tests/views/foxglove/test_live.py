@@ -85,7 +85,12 @@ async def test_a_robot_is_there_while_its_gateway_is_and_leaves_nothing_behind()
     assert ids(scene.viewer) == {}
     token = scene.robot.announce(GATEWAY)
     assert {"/r1/scan", "/r1/pose", "/r1/map", "/r1/log"} <= set(ids(scene.viewer))
-    assert {service.name for service in scene.live.commands.services()} >= {"/stop", "/r1/stop", "/r1/light", "/r1/mode"}
+    assert {service.name for service in scene.live.commands.services()} >= {
+        "/stop",
+        "/r1/stop",
+        "/r1/light",
+        "/r1/mode",
+    }
     scene.subscribe("/r1/pose")
     token.close()
     assert scene.keys() == []

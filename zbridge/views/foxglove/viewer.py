@@ -233,9 +233,6 @@ class Viewer:
             if channel is not None:
                 self._source.commands.unpublished(self, channel)
 
-    def _get(self, request: requests.GetParameters) -> None:
-        self._start(self._send_parameters(request.parameter_names, request.id))
-
     def _set(self, request: requests.SetParameters) -> None:
         if not self._start(self._set_parameters(request)):
             raise Unsupported(f"more than {CALLS} calls at the same time")
@@ -305,13 +302,13 @@ class Viewer:
             log.error("%s left: %s", self.name, describe(error))
 
 
-_Handler = Callable[[Viewer, Any], None]
+_Handler = Callable[[Viewer, Any], object]
 _HANDLERS: Mapping[type, _Handler] = {
     requests.Subscribe: Viewer._subscribe,
     requests.Unsubscribe: Viewer._unsubscribe,
     requests.Advertise: Viewer._advertise,
     requests.Unadvertise: Viewer._unadvertise,
-    requests.GetParameters: Viewer._get,
+    requests.GetParameters: lambda viewer, get: viewer._start(viewer._send_parameters(get.parameter_names, get.id)),
     requests.SetParameters: Viewer._set,
     requests.SubscribeParameterUpdates: Viewer._watch,
     requests.UnsubscribeParameterUpdates: Viewer._unwatch,

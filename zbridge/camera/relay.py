@@ -139,7 +139,7 @@ class Relay:
                 log.debug("camera relay: %s", error)
                 await asyncio.sleep(1.0)
                 continue
-            if len(self._clients) >= self._most or not self._admits(peer[0]):
+            if len(self._clients) >= self._most or (self._allow and not is_among(peer[0], self._allow)):
                 self._refused.value += 1
                 client.close()
                 await asyncio.sleep(_REFUSAL_S)
@@ -148,9 +148,6 @@ class Relay:
             task = asyncio.create_task(self._serve(client))
             self._clients.add(task)
             task.add_done_callback(self._clients.discard)
-
-    def _admits(self, host: str) -> bool:
-        return not self._allow or is_among(host, self._allow)
 
     async def _serve(self, client: socket.socket) -> None:
         """Answer one client, and give it pictures until it goes or takes none."""

@@ -12,7 +12,7 @@ from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
-from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed, InvalidHeader
 from websockets.headers import parse_subprotocol
 from websockets.http11 import Request as HttpRequest
@@ -113,7 +113,7 @@ class Front:
             )
         except OSError as error:
             raise ConfigError(f"--listen {self.address}: {error.strerror or error}") from error
-        self.address = Address(self.address.host, _port(server))
+        self.address = Address(self.address.host, int(next(iter(server.sockets)).getsockname()[1]))
         try:
             yield
         finally:
@@ -232,10 +232,6 @@ def _host(connection: ServerConnection) -> str:
     return str(peer[0])
 
 
-def _port(server: Server) -> int:
-    return int(next(iter(server.sockets)).getsockname()[1])
-
-
 async def serve_live(
     plan: FoxglovePlan, bus: BusSettings, realm: str, metrics: Metrics, on_ready: Callable[[Front], None]
 ) -> None:
@@ -262,11 +258,7 @@ async def serve_file(plan: FoxglovePlan, file: Path, metrics: Metrics, on_ready:
 async def _serve(plan: FoxglovePlan, source: ViewerSource, metrics: Metrics, on_ready: Callable[[Front], None]) -> None:
     tls = tls_context(*plan.tls) if plan.tls is not None else None
     front = Front(source, plan.address, plan.policy, metrics, tls)
-    async with front.serve(), _counters(plan, metrics):
+    counters = serve_metrics(plan.metrics, metrics) if plan.metrics is not None else contextlib.nullcontext()
+    async with front.serve(), counters:
         on_ready(front)
         await source.run()
-
-
-def _counters(plan: FoxglovePlan, metrics: Metrics) -> contextlib.AbstractAsyncContextManager[object]:
-    """Serve the counters to Prometheus, where that was asked for."""
-    return serve_metrics(plan.metrics, metrics) if plan.metrics is not None else contextlib.nullcontext()

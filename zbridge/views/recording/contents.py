@@ -91,7 +91,7 @@ def channel_of(key: str, *, datagram: bool = False) -> ChannelKind:
 
 def schema_of(message: type[FleetMessage]) -> Schema:
     """Make the schema of a message of its declaration."""
-    text = msgspec.json.schema(message, schema_hook=_unknown)
+    text = msgspec.json.schema(message, schema_hook=lambda kind: {"description": kind.__name__})
     return Schema(payloads.schema(message), "jsonschema", json.dumps(_binary(text), sort_keys=True).encode(), MSGPACK)
 
 
@@ -103,10 +103,6 @@ def read_sender(attachment: bytes | None) -> bytes | None:
         return payloads.decode(Authorization, attachment).lease
     except PayloadError:
         return None
-
-
-def _unknown(kind: type) -> dict[str, Any]:
-    return {"description": kind.__name__}
 
 
 def _binary(value: Any) -> Any:

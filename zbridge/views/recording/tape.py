@@ -61,13 +61,6 @@ class TapeSettings(msgspec.Struct, frozen=True):
         return self.path.with_name(f"{self.path.stem}-{number:04d}{self.path.suffix}")
 
 
-class Block(msgspec.Struct):
-    """What one write to the disk held: where it began, and its messages by topic."""
-
-    offset: int
-    counts: dict[str, int]
-
-
 class OutputFile:
     """A new file, written in blocks; raises FileExistsError, OSError."""
 
@@ -132,7 +125,8 @@ class Tape:
         self._writer: Any = None
         self._schemas: dict[str, int] = {}
         self._channels = 0
-        self._blocks: deque[Block] = deque(maxlen=_BLOCKS)
+        self._blocks: deque[tuple[int, dict[str, int]]] = deque(maxlen=_BLOCKS)
+        """What each write to the disk held: where it began, and its messages by topic."""
         self._counts: dict[str, int] = {}
         self._entries = 0
         self._whole = 0
@@ -236,9 +230,8 @@ class Tape:
                 if len(self._blocks) < 2:  # the first block is the header
                     self._release()
                     return False
-                block = self._blocks.pop()
-                self._lose(block.counts)
-                size = block.offset
+                size, counts = self._blocks.pop()
+                self._lose(counts)
             else:
                 self._release()
                 return True
@@ -252,7 +245,7 @@ class Tape:
         file = self._file
         assert file is not None
         file.flush()
-        self._blocks.append(Block(self._whole, self._counts))
+        self._blocks.append((self._whole, self._counts))
         self._whole = file.written  # not before this: the library flushes the file itself, too
         self._entries += len(self._counts) + 1
         self._counts, self._flushed = {}, now

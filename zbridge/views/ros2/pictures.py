@@ -233,18 +233,6 @@ class RosPictures:
         if "tf" in wanted and pose is not None:
             yield "tf", self._shapes.moved(pose, stamp_ns)
 
-    def _on_map(self, path: str, fleet_map: Map, stamp_ns: int, wanted: Container[str]) -> Made:
-        if "map" in wanted:
-            yield "map", self._shapes.occupancy_grid(fleet_map, stamp_ns)
-
-    def _on_battery(self, path: str, battery: Battery, stamp_ns: int, wanted: Container[str]) -> Made:
-        if "battery_state" in wanted:
-            yield "battery_state", self._shapes.battery_state(battery, stamp_ns)
-
-    def _on_image(self, path: str, image: Image, stamp_ns: int, wanted: Container[str]) -> Made:
-        if "image/compressed" in wanted:
-            yield "image/compressed", self._shapes.compressed_image(image, stamp_ns)
-
     def _on_reading(self, path: str, reading: Reading, stamp_ns: int, wanted: Container[str]) -> Made:
         name = self._names.get(topics.unescape(path.rpartition("/")[2]))
         kind = _KINDS.get(reading.kind or "")
@@ -269,14 +257,27 @@ class RosPictures:
         return iter(())
 
 
-_MAKERS: dict[type[FleetMessage], Callable[[RosPictures, str, Any, int, Container[str]], Made]] = {
+_Maker = Callable[[RosPictures, str, Any, int, Container[str]], Made]
+
+
+def _single(name: str, shape: Callable[[Shapes, Any, int], Any]) -> _Maker:
+    """Make the one ROS message of a fleet message."""
+
+    def make(pictures: RosPictures, path: str, message: Any, stamp_ns: int, wanted: Container[str]) -> Made:
+        if name in wanted:
+            yield name, shape(pictures._shapes, message, stamp_ns)
+
+    return make
+
+
+_MAKERS: dict[type[FleetMessage], _Maker] = {
     Scan: RosPictures._on_scan,
     Scanner: RosPictures._on_state,
     Pose: RosPictures._on_pose,
     Motion: RosPictures._on_motion,
-    Map: RosPictures._on_map,
-    Battery: RosPictures._on_battery,
-    Image: RosPictures._on_image,
+    Map: _single("map", Shapes.occupancy_grid),
+    Battery: _single("battery_state", Shapes.battery_state),
+    Image: _single("image/compressed", Shapes.compressed_image),
     Reading: RosPictures._on_reading,
     Status: RosPictures._on_state,
     Control: RosPictures._on_state,

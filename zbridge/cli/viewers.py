@@ -17,7 +17,7 @@ from zbridge.errors import ConfigError
 from zbridge.metrics import Metrics
 
 if TYPE_CHECKING:
-    from zbridge.views.foxglove.server import Front
+    from zbridge.views.foxglove.server import ViewerServer
     from zbridge.views.foxglove.settings import FoxgloveOptions
     from zbridge.views.ros2.server import View
 
@@ -36,9 +36,9 @@ def run_foxglove(bus: BusSettings, realm: str, file: Path | None, given: dict[st
         raise ConfigError(f"--drive: a {role} may not drive: expected the certificate of an operator")
     planned, metrics = plan(options), Metrics()
 
-    def ready(front: Front) -> None:
+    def ready(viewers: ViewerServer) -> None:
         scheme = "wss" if planned.tls is not None else "ws"
-        print(f"Foxglove connects to {scheme}://{str(front.address).removeprefix('tcp://')}", flush=True)  # noqa: T201
+        print(f"Foxglove connects to {scheme}://{str(viewers.address).removeprefix('tcp://')}", flush=True)  # noqa: T201
 
     if file is None:
         run_loop(until_signal(server.serve_live(planned, bus, realm, metrics, ready)))

@@ -56,7 +56,7 @@ _silent.addHandler(logging.NullHandler())
 _silent.propagate = False
 
 
-class Front:
+class ViewerServer:
     """Serves a source at an address. tls: None for plain WebSockets."""
 
     def __init__(
@@ -79,15 +79,15 @@ class Front:
         self._numbers = 0
 
     def __repr__(self) -> str:
-        return f"<Front {self.address}, {len(self.viewers)} viewers>"
+        return f"<ViewerServer {self.address}, {len(self.viewers)} viewers>"
 
     @contextlib.asynccontextmanager
     async def serve(self) -> AsyncIterator[None]:
         """Serve viewers while the context lasts; ``address`` has the port then. Raise ConfigError for a bad address."""
-        front = self
+        owner_of_connections = self
 
         class Guarded(_Guarded):
-            owner = front
+            owner = owner_of_connections
 
         tls: dict[str, Any] = {"ssl_handshake_timeout": HANDSHAKE_S} if self._tls is not None else {}
         try:
@@ -187,7 +187,7 @@ class _Guarded(ServerConnection):
     It sends without a task where the socket takes it: each turn of the event loop less is a tenth of the latency.
     """
 
-    owner: Front
+    owner: ViewerServer
     _counted = False
 
     def send_now(self, message: bytes) -> bool:
@@ -233,7 +233,7 @@ def _host(connection: ServerConnection) -> str:
 
 
 async def serve_live(
-    plan: FoxglovePlan, bus: BusSettings, realm: str, metrics: Metrics, on_ready: Callable[[Front], None]
+    plan: FoxglovePlan, bus: BusSettings, realm: str, metrics: Metrics, on_ready: Callable[[ViewerServer], None]
 ) -> None:
     """Serve the robots of a realm; raise BusError or ConfigError. on_ready: called when viewers are accepted."""
     async with contextlib.AsyncExitStack() as stack:
@@ -247,7 +247,9 @@ async def serve_live(
         await _serve(plan, live, metrics, on_ready)
 
 
-async def serve_file(plan: FoxglovePlan, file: Path, metrics: Metrics, on_ready: Callable[[Front], None]) -> None:
+async def serve_file(
+    plan: FoxglovePlan, file: Path, metrics: Metrics, on_ready: Callable[[ViewerServer], None]
+) -> None:
     """Serve a recording; raise ZbridgeError if it cannot be read. on_ready: called when viewers are accepted."""
     recording = await asyncio.to_thread(IndexedRecording, file)
     if not recording.whole:
@@ -255,10 +257,12 @@ async def serve_file(plan: FoxglovePlan, file: Path, metrics: Metrics, on_ready:
     await _serve(plan, Playback(Hub(), recording), metrics, on_ready)
 
 
-async def _serve(plan: FoxglovePlan, source: ViewerSource, metrics: Metrics, on_ready: Callable[[Front], None]) -> None:
+async def _serve(
+    plan: FoxglovePlan, source: ViewerSource, metrics: Metrics, on_ready: Callable[[ViewerServer], None]
+) -> None:
     tls = tls_context(*plan.tls) if plan.tls is not None else None
-    front = Front(source, plan.address, plan.policy, metrics, tls)
+    server = ViewerServer(source, plan.address, plan.policy, metrics, tls)
     counters = serve_metrics(plan.metrics, metrics) if plan.metrics is not None else contextlib.nullcontext()
-    async with front.serve(), counters:
-        on_ready(front)
+    async with server.serve(), counters:
+        on_ready(server)
         await source.run()

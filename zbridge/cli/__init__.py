@@ -90,12 +90,7 @@ def run_gateway(
         set_up_log(verbose=verbose)
     plan = load(file, tls=tls, content=content)
     hand_on_tls(tls)
-    if only is not None:
-        _require_protocol(plan, file, only)
-    try:
-        check_member(plan)
-    except ConfigError as error:
-        raise ConfigError(f"{file}: {error}") from error
+    _check(plan, file, only)
     gc.freeze()  # objects made at start-up live as long as the process; the collector skips them
     predecessor = socket.socket(fileno=take_over) if take_over is not None else None
     successor = reporter if reporter is not None else Spawn(file, verbose=verbose)
@@ -120,11 +115,15 @@ def run_gateway(
     _exit(left=gateway.left)
 
 
-def _require_protocol(plan: Plan, file: Path, only: str) -> None:
+def _check(plan: Plan, file: Path, only: str | None) -> None:
     parts = {"device": plan.device} if plan.device else {f"hq[{n}]": part for n, part in enumerate(plan.listeners)}
     for key, part in parts.items():
-        if part.protocol.name != only:
+        if only is not None and part.protocol.name != only:
             raise ConfigError(f"{file}: {key}.protocol = {part.protocol.name!r}: expected {only!r}")
+    try:
+        check_member(plan)
+    except ConfigError as error:
+        raise ConfigError(f"{file}: {error}") from error
 
 
 def _exit(*, left: bool) -> None:

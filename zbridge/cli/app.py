@@ -50,6 +50,19 @@ Files = Annotated[
     list[Path], typer.Argument(help="a gateway's configuration (TOML), several, or a directory", show_default=False)
 ]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="log every frame")]
+SimulatedAt = Annotated[
+    list[str],
+    typer.Option(
+        help="address to listen at, tcp://host:port; port 0: any free one; once for each link. "
+        "By default where `zbridge init` expects a robot"
+    ),
+]
+ServedBy = Annotated[
+    str, typer.Option(help="be an HQ program instead, as fragile as deployed ones, and connect to this address")
+]
+Drives = Annotated[
+    str, typer.Option(help="with --hq: drive FORWARD or FORWARD,TURN, fractions of full scale: 0.3 or 0.3,-0.2")
+]
 
 
 @app.command()
@@ -137,19 +150,9 @@ def init(
 @app.command()
 def simulate(
     protocol: Annotated[str, typer.Argument(help="one of: " + ", ".join(protocol_names()), show_default=False)],
-    listen: Annotated[
-        list[str],
-        typer.Option(
-            help="address to listen at, tcp://host:port; port 0: any free one; once for each link. "
-            "By default where `zbridge init` expects a robot"
-        ),
-    ] = [],
-    hq: Annotated[
-        str, typer.Option(help="be an HQ program instead, as fragile as deployed ones, and connect to this address")
-    ] = "",
-    drive: Annotated[
-        str, typer.Option(help="with --hq: drive FORWARD or FORWARD,TURN, fractions of full scale: 0.3 or 0.3,-0.2")
-    ] = "",
+    listen: SimulatedAt = [],
+    hq: ServedBy = "",
+    drive: Drives = "",
     seed: Annotated[int, typer.Option(help="the same seed makes the same world")] = 1,
     version: Annotated[str, typer.Option(help="version of the protocol; the newest common one by default")] = "",
     dialect: Annotated[str, typer.Option(help="dialect of the protocol, where it has several")] = "",

@@ -18,12 +18,19 @@ from zbridge.client import bus_settings
 
 app = typer.Typer()
 
+Recorded = Annotated[
+    Path | None, typer.Argument(help="a recording (MCAP) to play, instead of live robots", show_default=False)
+]
+FullSpeeds = Annotated[list[str], typer.Option(help="m/s at full scale, NUMBER or ROBOT=NUMBER; 1 by default")]
+FullTurns = Annotated[list[str], typer.Option(help="rad/s at full scale, NUMBER or ROBOT=NUMBER; 1 by default")]
+DriverName = Annotated[
+    str, typer.Option(help="what drivers are called first: the name of the certificate, else foxglove")
+]
+
 
 @app.command()
 def foxglove(
-    file: Annotated[
-        Path | None, typer.Argument(help="a recording (MCAP) to play, instead of live robots", show_default=False)
-    ] = None,
+    file: Recorded = None,
     listen: Annotated[str, typer.Option(help="host:port for Foxglove; port 0: any free one")] = "127.0.0.1:8765",
     robot: Annotated[list[str], typer.Option(help="show this robot only; once for each; all by default")] = [],
     drive: Annotated[bool, typer.Option("--drive", help="let viewers with the token or a listed Origin drive")] = False,
@@ -33,15 +40,9 @@ def foxglove(
     tls_certificate: Annotated[Path | None, typer.Option(help="certificate (PEM), for wss://")] = None,
     tls_key: Annotated[Path | None, typer.Option(help="its key (PEM)")] = None,
     insecure: Annotated[bool, typer.Option("--insecure", help="serve other machines without TLS")] = False,
-    speed_full_mps: Annotated[
-        list[str], typer.Option(help="m/s at full scale, NUMBER or ROBOT=NUMBER; 1 by default")
-    ] = [],
-    turn_full_radps: Annotated[
-        list[str], typer.Option(help="rad/s at full scale, NUMBER or ROBOT=NUMBER; 1 by default")
-    ] = [],
-    who: Annotated[
-        str, typer.Option(help="what drivers are called first: the name of the certificate, else foxglove")
-    ] = "",
+    speed_full_mps: FullSpeeds = [],
+    turn_full_radps: FullTurns = [],
+    who: DriverName = "",
     viewers: Annotated[int, typer.Option(help="most viewers at a time", min=1, max=1000)] = 32,
     metrics: Annotated[str, typer.Option(help="host:port at which Prometheus reads the counters")] = "",
     connect: Connect = [],

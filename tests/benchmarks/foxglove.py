@@ -32,7 +32,7 @@ from tests.e2e.processes import Part
 from tests.e2e.robots import Robot, position
 from tests.ports import free_port
 from tests.views.protobuf import read
-from zbridge.views.pictures import foxglove_schema
+from zbridge.views.schemas import foxglove_schema
 
 SECONDS = 10.0
 ROUNDS, ROUND_S, PERIOD_S = 6, 3.0, 0.02

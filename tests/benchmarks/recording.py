@@ -25,7 +25,7 @@ from tests.benchmarks.recording_source import POSE_HZ, SCAN_HZ, scans
 from tests.ports import free_port
 from tests.views.recording import files
 from zbridge.views.recording.player import Player
-from zbridge.views.recording.reader import Reader
+from zbridge.views.recording.reader import RecordingReader
 from zbridge.views.recording.selection import Selection
 
 ROBOTS = 30
@@ -64,7 +64,7 @@ class Recorded:
         source.end()
         self.sent = int(heard["sent"])
         with path.open("rb") as file:
-            topics = [message.channel.topic for message in Reader(file).messages()]
+            topics = [message.channel.topic for message in RecordingReader(file).messages()]
         self.written = sum(topic.startswith("fleet/b") and "@" not in topic for topic in topics)
         self.counted = sum(map(int, re.findall(r"^lost, .*: (\d+)$", self.said, re.MULTILINE)))
 
@@ -75,7 +75,7 @@ def size_ratio(path: Path, folder: Path) -> float:
         writer = Writer(plain, compression=CompressionType.ZSTD)
         writer.start()
         channels: dict[str, int] = {}
-        for message in Reader(file).messages():
+        for message in RecordingReader(file).messages():
             topic = message.channel.topic
             if topic not in channels:
                 channels[topic] = writer.register_channel(topic, "msgpack", 0)

@@ -14,9 +14,9 @@ from zbridge.camera import CameraSettings, plan_camera
 from zbridge.camera import camera as cameras
 from zbridge.camera.camera import RETRY_S, Camera
 from zbridge.camera.demand import LINGER_S
-from zbridge.camera.mjpeg import MjpegReader, Part
-from zbridge.camera.settings import Source
-from zbridge.camera.upstream import Took
+from zbridge.camera.mjpeg import MjpegPart, MjpegReader
+from zbridge.camera.settings import CameraSource
+from zbridge.camera.upstream import OnParts
 from zbridge.control.context import Conditions
 from zbridge.errors import LinkError
 from zbridge.fleet import payload as payloads
@@ -39,15 +39,15 @@ class Scene:
         """When a stream was begun."""
         self.fetching = 0
         self.end: asyncio.Future[Exception]
-        self.took: Took
+        self.took: OnParts
         self.loop = asyncio.get_running_loop()
         plan = plan_camera(CameraSettings("http://robot/s", rate_hz=rate_hz, stall_s=3.0))
         monkeypatch.setattr(cameras, "fetch", self._fetch)
         self.camera = Camera(plan, KeySpace("fleet", "r1"), self.bus, self.metrics, self.conditions, lambda: STAMP_NS)
         self._watched = False
 
-    async def _fetch(self, source: Source, stall_s: float, took: Took) -> None:
-        assert (source, stall_s) == (Source("robot", 80, "/s"), 3.0)
+    async def _fetch(self, source: CameraSource, stall_s: float, took: OnParts) -> None:
+        assert (source, stall_s) == (CameraSource("robot", 80, "/s"), 3.0)
         self.took, self.end = took, self.loop.create_future()
         self.begun.append(self.loop.time())
         self.fetching += 1
@@ -63,7 +63,7 @@ class Scene:
     def read(self, *pictures: bytes, bad: int = 0) -> None:
         """Give the camera what one read of its stream brought."""
         stream = MjpegReader()
-        parts: list[Part] = stream.receive(HEAD + b"".join(map(part, pictures)) + part(b"no jpeg") * bad)
+        parts: list[MjpegPart] = stream.receive(HEAD + b"".join(map(part, pictures)) + part(b"no jpeg") * bad)
         self.took(stream, parts)
 
     def images(self) -> list[Image]:

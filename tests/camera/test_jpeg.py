@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.camera.camera_bytes import jpeg
-from zbridge.camera.jpeg import is_whole, size
+from zbridge.camera.mjpeg import is_whole, jpeg_size
 
 SOI, SOF2 = b"\xff\xd8", bytes.fromhex("ffc2 0011 08 0438 0780 03")
 SIZES: dict[str, tuple[bytes, tuple[int, int] | None]] = {
@@ -25,7 +25,7 @@ SIZES: dict[str, tuple[bytes, tuple[int, int] | None]] = {
 @pytest.mark.parametrize("name", SIZES)
 def test_the_frame_header_tells_the_size(name: str) -> None:
     data, expected = SIZES[name]
-    assert size(data) == expected
+    assert jpeg_size(data) == expected
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from zbridge.camera.pace import BYTES_S, PICTURES_S, Budget, Pace
+from zbridge.camera.pace import BYTES_S, PICTURES_S, Pace, ReadBudget
 
 
 def passed(rate_hz: float, every_s: float, count: int) -> tuple[list[int], int]:
@@ -42,14 +42,14 @@ def test_the_last_one_is_passed_on_also_when_none_follows() -> None:
 
 @pytest.mark.parametrize("flood", [(BYTES_S // 100, 0), (1, PICTURES_S // 100)], ids=["bytes", "pictures"])
 def test_a_camera_that_sends_without_end_is_read_at_the_budget(flood: tuple[int, int]) -> None:
-    budget, now, reads = Budget(), 1000.0, 0
+    budget, now, reads = ReadBudget(), 1000.0, 0
     while now < 1010.0:
-        now += budget.rest_s(*flood, now) + 1e-6
+        now += budget.pause_s(*flood, now) + 1e-6
         reads += 1
     per_second = 100 if flood[0] > 1 else PICTURES_S / (PICTURES_S // 100)
     assert reads == pytest.approx(11 * per_second, rel=0.02), "ten seconds, and the one that was saved"
 
 
 def test_an_honest_camera_is_never_kept_waiting() -> None:
-    budget = Budget()
-    assert all(budget.rest_s(300_000, 1, 1000.0 + number / 60) == 0 for number in range(600))
+    budget = ReadBudget()
+    assert all(budget.pause_s(300_000, 1, 1000.0 + number / 60) == 0 for number in range(600))

@@ -14,10 +14,9 @@ from tests.camera.camera_bytes import HEAD, jpeg, part
 from tests.ports import free_port
 from zbridge.camera import relay as relays
 from zbridge.camera.demand import Demand
-from zbridge.camera.latest import Latest
 from zbridge.camera.mjpeg import MjpegReader
-from zbridge.camera.relay import Relay
-from zbridge.camera.settings import CameraPlan, CameraSettings, Source
+from zbridge.camera.relay import Latest, Relay
+from zbridge.camera.settings import CameraPlan, CameraSettings, CameraSource
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 
@@ -52,7 +51,7 @@ async def serving(port: int = 0, *allow: str, clients: int = 16) -> AsyncIterato
     settings = CameraSettings(url="http://robot/", clients=clients)
     networks = tuple(map(ipaddress.ip_network, allow))
     scene = Scene(port or free_port(), Demand(), Latest(), Metrics(), [], [])
-    plan = CameraPlan(Source("robot", 80, "/"), settings, None, networks)
+    plan = CameraPlan(CameraSource("robot", 80, "/"), settings, None, networks)
     relay = Relay(plan, Address(HOST, scene.port), scene.demand, scene.latest, scene.metrics, scene.told.append)
     running = asyncio.create_task(relay.run())
     try:

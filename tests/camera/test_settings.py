@@ -5,19 +5,19 @@ from __future__ import annotations
 import pytest
 
 from zbridge.camera import CameraSettings, plan_camera
-from zbridge.camera.settings import Source
+from zbridge.camera.settings import CameraSource
 from zbridge.errors import ConfigError
 from zbridge.protocol.address import Address
 
 SOURCES = [
-    ("http://robot", Source("robot", 80, "/"), "robot:80"),
-    ("http://10.0.0.7:8000/stream.mjpg?key=1", Source("10.0.0.7", 8000, "/stream.mjpg?key=1"), "10.0.0.7:8000"),
-    ("http://[::1]:81/a", Source("::1", 81, "/a"), "[::1]:81"),
+    ("http://robot", CameraSource("robot", 80, "/"), "robot:80"),
+    ("http://10.0.0.7:8000/stream.mjpg?key=1", CameraSource("10.0.0.7", 8000, "/stream.mjpg?key=1"), "10.0.0.7:8000"),
+    ("http://[::1]:81/a", CameraSource("::1", 81, "/a"), "[::1]:81"),
 ]
 
 
 @pytest.mark.parametrize(("url", "source", "authority"), SOURCES)
-def test_a_url_names_host_port_and_target(url: str, source: Source, authority: str) -> None:
+def test_a_url_names_host_port_and_target(url: str, source: CameraSource, authority: str) -> None:
     plan = plan_camera(CameraSettings(url))
     assert (plan.source, plan.source.authority) == (source, authority)
     assert (plan.relay, plan.allow) == (None, ())

@@ -9,8 +9,8 @@ import pytest
 
 from tests.camera.camera_bytes import HEAD, jpeg, part
 from zbridge.camera import upstream
-from zbridge.camera.mjpeg import MjpegReader, Part
-from zbridge.camera.settings import Source
+from zbridge.camera.mjpeg import MjpegPart, MjpegReader
+from zbridge.camera.settings import CameraSource
 from zbridge.errors import LinkError, ProtocolError
 
 pytestmark = pytest.mark.jumping
@@ -36,21 +36,21 @@ class _Writer:
 
 async def fetched(monkeypatch: pytest.MonkeyPatch, *stream: bytes) -> tuple[float, int, str]:
     """Fetch a stream that is there at once; return how long it took, the pictures, and why it ended."""
-    reader, pictures = asyncio.StreamReader(), list[Part]()
+    reader, pictures = asyncio.StreamReader(), list[MjpegPart]()
     for data in stream:
         reader.feed_data(data)
 
-    async def connect(source: Source) -> tuple[asyncio.StreamReader, _Writer]:
+    async def connect(source: CameraSource) -> tuple[asyncio.StreamReader, _Writer]:
         return reader, _Writer()
 
-    def took(stream: MjpegReader, parts: list[Part]) -> None:
+    def took(stream: MjpegReader, parts: list[MjpegPart]) -> None:
         pictures.extend(parts)
 
     monkeypatch.setattr(upstream, "_connect", connect)
     loop = asyncio.get_running_loop()
     begun = loop.time()
     with pytest.raises(LinkError) as error:
-        await upstream.fetch(Source("camera", 80, "/"), STALL_S, took)
+        await upstream.fetch(CameraSource("camera", 80, "/"), STALL_S, took)
     return loop.time() - begun, len(pictures), str(error.value)
 
 
@@ -63,7 +63,7 @@ async def test_a_camera_that_sends_bad_parts_quickly_is_ended_in_time(monkeypatc
 async def test_bad_parts_without_any_rest_do_not_hide_the_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
     """What waits in the buffer is read without waiting: no timeout of a read can end that."""
     loop = asyncio.get_running_loop()
-    monkeypatch.setattr(upstream.Budget, "rest_s", lambda *_: 0.01)
+    monkeypatch.setattr(upstream.ReadBudget, "pause_s", lambda *_: 0.01)
     begun = loop.time()
     took_s, pictures, why = await fetched(monkeypatch, HEAD, *[BAD * (READ_BYTES // len(BAD))] * 1000)
     assert (took_s, pictures, why) == (pytest.approx(STALL_S, abs=0.05), 0, "no picture for 3 s")
@@ -77,7 +77,7 @@ async def test_a_picture_now_and_then_keeps_a_stream_of_bad_parts(monkeypatch: p
     assert took_s > STALL_S
 
 
-def no_picture(stream: MjpegReader, parts: list[Part]) -> None:
+def no_picture(stream: MjpegReader, parts: list[MjpegPart]) -> None:
     assert parts == []
 
 
@@ -98,7 +98,7 @@ async def test_a_stream_is_asked_for_in_http_1_0_and_its_connection_closed_at_it
 
     monkeypatch.setattr(asyncio, "open_connection", connect)
     with pytest.raises((LinkError, ProtocolError), match=f"^{ENDS[status]}$"):
-        await upstream.fetch(Source("::1", 8000, "/stream.mjpg?q=1"), STALL_S, no_picture)
+        await upstream.fetch(CameraSource("::1", 8000, "/stream.mjpg?q=1"), STALL_S, no_picture)
     line, host, *_, blank, rest = writer.written.split(b"\r\n")
     assert (line, host, blank, rest) == (b"GET /stream.mjpg?q=1 HTTP/1.0", b"Host: [::1]:8000", b"", b"")
     assert writer.aborted
@@ -123,17 +123,17 @@ async def test_a_camera_that_is_not_reached_is_told_in_the_words_of_the_operatin
 
     monkeypatch.setattr(asyncio, "open_connection", connect)
     with pytest.raises(LinkError, match=told):
-        await upstream.fetch(Source("robot", 80, "/"), STALL_S, no_picture)
+        await upstream.fetch(CameraSource("robot", 80, "/"), STALL_S, no_picture)
 
 
 async def test_a_connection_that_breaks_is_told_and_closed(monkeypatch: pytest.MonkeyPatch) -> None:
     reader, writer = asyncio.StreamReader(), _Writer()
     reader.set_exception(ConnectionResetError(104, "reset"))
 
-    async def connect(source: Source) -> tuple[asyncio.StreamReader, _Writer]:
+    async def connect(source: CameraSource) -> tuple[asyncio.StreamReader, _Writer]:
         return reader, writer
 
     monkeypatch.setattr(upstream, "_connect", connect)
     with pytest.raises(LinkError, match=r"^Connection reset by peer$"):
-        await upstream.fetch(Source("robot", 80, "/"), STALL_S, no_picture)
+        await upstream.fetch(CameraSource("robot", 80, "/"), STALL_S, no_picture)
     assert writer.aborted

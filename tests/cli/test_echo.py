@@ -8,7 +8,7 @@ import pytest
 
 from zbridge.bus import Bus, BusSettings
 from zbridge.bus.fake import FakeBus
-from zbridge.cli.bus import EchoOptions, echo
+from zbridge.cli.bus import echo
 from zbridge.errors import ConfigError
 from zbridge.fleet import topics
 
@@ -52,7 +52,7 @@ async def test_what_is_no_key_expression_of_the_realm_is_refused_in_one_line(
     key: str, realm: str | None, why: str
 ) -> None:
     with pytest.raises(ConfigError) as error:
-        await echo(NOWHERE, EchoOptions(key=key, realm=realm))
+        await echo(NOWHERE, key, realm=realm)
     assert str(error.value) == why
 
 
@@ -70,7 +70,7 @@ async def test_what_is_no_key_expression_of_the_realm_is_refused_in_one_line(
 async def test_the_realm_is_that_of_the_key_or_the_one_that_is_given(
     bus: FakeBus, key: str, realm: str | None, joined: str | None
 ) -> None:
-    await echo(NOWHERE, EchoOptions(key=key, realm=realm, seconds=SECONDS))
+    await echo(NOWHERE, key, realm=realm, seconds=SECONDS)
     assert bus.joined == [joined]  # type: ignore[attr-defined]
 
 
@@ -87,7 +87,7 @@ async def test_the_realm_is_that_of_the_key_or_the_one_that_is_given(
 async def test_the_time_ends_and_with_too_few_messages_that_is_a_failure(
     bus: FakeBus, capfd: pytest.CaptureFixture[str], messages: int, count: int, done: bool, said: str
 ) -> None:
-    echoing = asyncio.create_task(echo(NOWHERE, EchoOptions(key="fleet/r1/pose", count=count, seconds=SECONDS)))
+    echoing = asyncio.create_task(echo(NOWHERE, "fleet/r1/pose", count=count, seconds=SECONDS))
     await asyncio.sleep(SECONDS / 2)
     publisher = bus.publisher("fleet/r1/pose", topics.POSE)
     for _ in range(messages):

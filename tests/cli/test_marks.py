@@ -6,7 +6,7 @@ import pytest
 
 from tests.certificates import Authority
 from zbridge.bus import BusSettings, Tls
-from zbridge.cli.recorded import put_mark
+from zbridge.cli.recording import put_mark
 from zbridge.errors import ConfigError
 
 

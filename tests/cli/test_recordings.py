@@ -15,8 +15,7 @@ from tests.views.recording import files
 from zbridge.bus import BusSettings
 from zbridge.bus.fake import FakeBus
 from zbridge.cli.bus import print_columns
-from zbridge.cli.recorded import RecordOptions, run_record, show_info
-from zbridge.cli.replayed import ReplayOptions, run_replay, run_wire
+from zbridge.cli.recording import RecordOptions, ReplayOptions, run_record, run_replay, run_wire, show_info
 from zbridge.errors import ConfigError
 from zbridge.fleet import topics
 
@@ -124,7 +123,7 @@ async def test_a_replay_counts_what_it_plays_and_what_it_leaves_out(
     async def joined(settings: BusSettings, realm: str | None) -> AsyncIterator[FakeBus]:
         yield FakeBus()
 
-    monkeypatch.setattr("zbridge.cli.replayed.joined", joined)
+    monkeypatch.setattr("zbridge.cli.recording.joined", joined)
     await run_replay(NOWHERE, ReplayOptions(path=path, **{**REPLAY, "robots": ("r1=again",), "speed": 1000.0}))
     assert capsys.readouterr().err.splitlines() == [
         "r1 as again",
@@ -145,8 +144,8 @@ async def test_record_and_info_say_the_same_number_of_messages(
         work.close()
         bus.publisher("fleet/r1/@cmd/drive", topics.CMD_DRIVE).put(b"\x80", b"")
 
-    monkeypatch.setattr("zbridge.cli.recorded.joined", joined)
-    monkeypatch.setattr("zbridge.cli.recorded.until_signal", until_signal)
+    monkeypatch.setattr("zbridge.cli.recording.joined", joined)
+    monkeypatch.setattr("zbridge.cli.recording.until_signal", until_signal)
     path = tmp_path / "a.mcap"
     assert await run_record(NOWHERE, RecordOptions(output=path, **RECORD))
     said = capsys.readouterr().err

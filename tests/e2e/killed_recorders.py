@@ -24,7 +24,7 @@ from mcap.stream_reader import StreamReader
 from tests.benchmarks.recording_source import scans
 from tests.e2e.conftest import HOST, configuration
 from tests.ports import free_port
-from zbridge.views.recording.reader import Reader
+from zbridge.views.recording.reader import RecordingReader
 
 SCAN_HZ = 200.0
 LATE_S = 1.0
@@ -60,7 +60,7 @@ def kill_one(endpoint: str, path: Path, seconds: float) -> Killed:
     recorder.wait()
     recorder.stderr.close()
     with path.open("rb") as file:
-        reader = Reader(file)
+        reader = RecordingReader(file)
         ours = list(reader.messages())
     theirs = 0
     with path.open("rb") as file, contextlib.suppress(McapError, EOFError):

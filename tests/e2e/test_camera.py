@@ -23,7 +23,7 @@ from tests.e2e.foxglove_viewer import viewing
 from tests.ports import free_port
 from tests.views.protobuf import read
 from tests.views.recording import files
-from zbridge.views.pictures import foxglove_schema
+from zbridge.views.schemas import foxglove_schema
 
 HOST = "127.0.0.1"
 

@@ -21,7 +21,7 @@ from tests.e2e.foxglove_viewer import Viewer, viewing
 from tests.ports import free_port
 from tests.views.foxglove.recordings import BEGIN_NS, record
 from tests.views.protobuf import read
-from zbridge.views.pictures import foxglove_schema
+from zbridge.views.schemas import foxglove_schema
 
 PAGE, EVIL = "http://robots.example", "http://evil.example"
 TOKEN = "0123456789abcdef0123456789abcdef"

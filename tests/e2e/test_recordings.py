@@ -17,7 +17,7 @@ from tests.e2e.hq_judge import Alf, Ec, Program, Tcp
 from tests.e2e.hq_scene import playing, soon
 from tests.ports import free_port
 from tests.views.recording import files
-from zbridge.views.recording.reader import Reader
+from zbridge.views.recording.reader import RecordingReader
 
 STAMPS = ("stamp_ns", "device_ms")
 
@@ -33,7 +33,7 @@ def record(bench: Bench, path: Path, *options: str) -> Any:
 def messages(path: Path) -> list[tuple[str, bytes]]:
     """Read a file that may be cut off."""
     with path.open("rb") as file:
-        return [(message.channel.topic, message.data) for message in Reader(file).messages()]
+        return [(message.channel.topic, message.data) for message in RecordingReader(file).messages()]
 
 
 def test_a_robot_is_recorded_with_its_commands_refusals_marks_and_frames(bench: Bench, tmp_path: Path) -> None:
@@ -73,7 +73,7 @@ def test_a_recorder_that_is_killed_leaves_a_file_that_is_readable_to_the_cut(ben
     kept = messages(path)
     assert len(kept) > 20
     with path.open("rb") as file:
-        reader = Reader(file)
+        reader = RecordingReader(file)
         assert len(list(reader.messages())) == len(kept)
         assert not reader.ended
     said = bench.zbridge("info", str(path)).communicate(timeout=30)[0]

@@ -19,7 +19,7 @@ from tests.ports import free_port
 from zbridge.app.roles import Member, Roles
 from zbridge.bus import BusSettings
 from zbridge.bus.tls.files import folder_tls
-from zbridge.cli.restart import restart
+from zbridge.cli.gateway_commands import restart
 from zbridge.client import Fleet
 from zbridge.errors import BusRefused, Malformed
 

@@ -13,8 +13,7 @@ from tests.camera import camera_bytes
 from tests.fuzz.target import Target, comparable, cut, require_same
 from tests.views.recording import files as recorded
 from zbridge.app import config, prometheus
-from zbridge.camera import jpeg
-from zbridge.camera.mjpeg import HEAD_BYTES, PICTURE_BYTES, MjpegReader
+from zbridge.camera.mjpeg import HEAD_BYTES, PICTURE_BYTES, MjpegReader, is_jpeg, jpeg_size
 from zbridge.errors import ConfigError, ProtocolError
 from zbridge.fleet.topics import KeySpace
 from zbridge.metrics import Metrics
@@ -26,7 +25,7 @@ KEPT_BYTES = PICTURE_BYTES + HEAD_BYTES + (1 << 20)
 
 def read_recording(data: bytes) -> None:
     """Read a file as MCAP; count what it holds, and find the frames of its links."""
-    found = reader.Reader(io.BytesIO(data))
+    found = reader.RecordingReader(io.BytesIO(data))
     messages, summaries = [], {}
     for message in found.messages():
         messages.append(message)
@@ -56,8 +55,8 @@ def _pictures(reads: list[bytes]) -> list[Any]:
             parts += found
             assert len(mjpeg._buffer) <= KEPT_BYTES
             for part in found:
-                assert jpeg.is_jpeg(part.jpeg)
-                jpeg.size(part.jpeg)
+                assert is_jpeg(part.jpeg)
+                jpeg_size(part.jpeg)
     except ProtocolError as error:
         fault = str(error)
     if fault and len(reads) == 1:  # one broken read gives none of its parts
@@ -84,7 +83,7 @@ def targets() -> Iterator[Target]:
     """Yield the targets."""
     yield Target("mcap", read_recording, _recordings, ("zbridge/views/recording/reader.py",
                  "zbridge/views/recording/wire_tape.py", "zbridge/views/recording/summary.py"), 8192)  # fmt: skip
-    yield Target("mjpeg", read_camera, _answers, ("zbridge/camera/mjpeg.py", "zbridge/camera/jpeg.py"), 8192)
+    yield Target("mjpeg", read_camera, _answers, ("zbridge/camera/mjpeg.py",), 8192)
     yield Target("http", answer_http, _requests, (), 1024)
     yield Target("configuration", read_configuration, _configurations, ())
 

@@ -22,14 +22,14 @@ from zbridge.protocol.address import Address, parse_device_address
 from zbridge.protocol.samples import KeyedSample, SampleKind, read_sample, write_sample
 from zbridge.robot import ownership
 from zbridge.ros2 import Attachment, read_attachment, types_of
-from zbridge.ros2.tokens import read_token
+from zbridge.ros2.rmw_zenoh import read_token
 from zbridge.views.foxglove import requests
 from zbridge.views.foxglove.twist import Scale
 from zbridge.views.foxglove.twist import read_twist as read_json_twist
-from zbridge.views.recording.stamps import with_stamp
 from zbridge.views.ros2.cmd_vel import STAMPED, TWIST
 from zbridge.views.ros2.cmd_vel import read_twist as read_cdr_twist
-from zbridge.views.ros2.settings import Body
+from zbridge.views.ros2.settings import RobotBody
+from zbridge.views.stamps import with_stamp
 
 KINDS = sorted(
     (kind for kind in vars(messages).values() if isinstance(kind, type) and issubclass(kind, FleetMessage)),
@@ -151,7 +151,7 @@ def read_cdr(data: bytes) -> None:
         require_same("written and read again", TYPES.encode(TYPES.decode(kind, written)), written)
     for twist in (TWIST, STAMPED):
         with contextlib.suppress(ProtocolError, Malformed, Unsupported):
-            drive = read_cdr_twist(TYPES, twist, body, Body())
+            drive = read_cdr_twist(TYPES, twist, body, RobotBody())
             require_drivable(drive)
 
 
@@ -171,14 +171,14 @@ def require_drivable(drive: messages.Drive) -> None:
 
 def targets() -> Iterator[Target]:
     """Yield the targets."""
-    yield Target("fleet-payload", read_fleet, _fleet, ("zbridge/fleet/payload.py", "zbridge/views/recording/stamps.py"))
+    yield Target("fleet-payload", read_fleet, _fleet, ("zbridge/fleet/payload.py", "zbridge/views/stamps.py"))
     yield Target("authorization", read_authorization, _authorizations, (), 256)
     yield Target("stop", read_stops, _stops, ("zbridge/control/latch.py",), 512)
     yield Target("claim", read_claim, _claims, ())
     yield Target("process", read_process, _processes, ())
-    yield Target("key", read_key, _keys, ("zbridge/fleet/topics.py", "zbridge/ros2/tokens.py", "zbridge/ros2/qos.py",
+    yield Target("key", read_key, _keys, ("zbridge/fleet/topics.py", "zbridge/ros2/rmw_zenoh.py",
                                            "zbridge/protocol/address.py"), 512)  # fmt: skip
-    yield Target("keyed-sample", read_keyed, _samples, ("zbridge/protocol/samples.py", "zbridge/ros2/attachment.py"))
+    yield Target("keyed-sample", read_keyed, _samples, ("zbridge/protocol/samples.py", "zbridge/ros2/rmw_zenoh.py"))
     yield Target("cdr", read_cdr, _cdr, ("zbridge/ros2/types.py", "zbridge/views/ros2/cmd_vel.py"))
     yield Target("viewer", read_viewer, _viewer, ("zbridge/views/foxglove/requests.py",
                                                   "zbridge/views/foxglove/twist.py"))  # fmt: skip

@@ -16,8 +16,8 @@ from zbridge.ros2 import (
     Endpoint,
     Kind,
     Node,
-    QoS,
     Reliability,
+    RosQoS,
     all_tokens,
     dds_type,
     endpoints_of,
@@ -27,9 +27,7 @@ from zbridge.ros2 import (
     ros_type,
     topic_key,
 )
-from zbridge.ros2.attachment import read_attachment
-from zbridge.ros2.qos import read_qos
-from zbridge.ros2.tokens import gid_of
+from zbridge.ros2.rmw_zenoh import gid_of, read_attachment, read_qos
 
 STRING = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 ADD = "RIHS01_e118de6bf5eeb66a2491b5bda11202e7b68f198d6f67922cf30364858239c81a"
@@ -84,8 +82,8 @@ QOS = {
     "::,10:,:,:,,": KEEP_LAST_10,
     ":1:,1:,:,:,,": LATCHED,
     "2::,5:,:,:,,": SENSOR_DATA,
-    "::,:,:,:,,": QoS(depth=42),
-    "2:1:2,:,:,:,,": QoS(Reliability.BEST_EFFORT, Durability.TRANSIENT_LOCAL, 0),
+    "::,:,:,:,,": RosQoS(depth=42),
+    "2:1:2,:,:,:,,": RosQoS(Reliability.BEST_EFFORT, Durability.TRANSIENT_LOCAL, 0),
 }
 NAMES = {"r1": "r1", "front left": "front_left", "7": "_7", "": "_", "a-b.c": "a_b_c", "Ä": "_"}
 
@@ -136,7 +134,7 @@ def test_a_gid_is_the_xxh3_128_of_the_token_low_half_first() -> None:
 
 
 @pytest.mark.parametrize(("text", "qos"), QOS.items())
-def test_qos_is_read_and_written(text: str, qos: QoS) -> None:
+def test_qos_is_read_and_written(text: str, qos: RosQoS) -> None:
     assert str(qos) == text
     assert read_qos(text) == qos
 
@@ -187,10 +185,10 @@ def test_all_tokens_of_a_domain_or_of_a_kind_are_asked_for() -> None:
 
 
 FOREIGN_QOS = {  # other numbers of rmw's policies, as rmw_zenoh may write them
-    "1:2:1,7:,:,:,,": QoS(depth=7),
-    "0:0:0,:,:,:,,": QoS(depth=42),
-    "3:3:3,1:,:,:,,": QoS(depth=1),
-    "2:1:2,9:,:,:,,": QoS(Reliability.BEST_EFFORT, Durability.TRANSIENT_LOCAL, 0),
+    "1:2:1,7:,:,:,,": RosQoS(depth=7),
+    "0:0:0,:,:,:,,": RosQoS(depth=42),
+    "3:3:3,1:,:,:,,": RosQoS(depth=1),
+    "2:1:2,9:,:,:,,": RosQoS(Reliability.BEST_EFFORT, Durability.TRANSIENT_LOCAL, 0),
     "::,10:,:,:,,:more": KEEP_LAST_10,
     "4::,10:,:,:,,": None,
     ":4:,10:,:,:,,": None,

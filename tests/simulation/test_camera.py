@@ -8,19 +8,17 @@ import hashlib
 import pytest
 
 from tests.camera.camera_bytes import HEAD
-from zbridge.camera import jpeg
-from zbridge.camera.mjpeg import MjpegReader
+from zbridge.camera.mjpeg import MjpegReader, jpeg_size
 from zbridge.errors import LinkError
 from zbridge.protocol.address import Address
-from zbridge.simulation.camera import COLUMNS, ROWS, scene, serve_camera
-from zbridge.simulation.drawing import draw
+from zbridge.simulation.camera import COLUMNS, ROWS, draw, scene, serve_camera
 
 
 def test_a_picture_is_what_a_decoder_was_seen_to_read() -> None:
     """libjpeg (by Pillow) gave back every grey of these bytes."""
     assert draw(bytes((0, 255, 128, 129)), 2).hex()[-60:] == LAST
     assert hashlib.sha256(draw(scene(150), COLUMNS)).hexdigest() == SCENE
-    assert jpeg.size(draw(scene(0), COLUMNS)) == (8 * COLUMNS, 8 * ROWS)
+    assert jpeg_size(draw(scene(0), COLUMNS)) == (8 * COLUMNS, 8 * ROWS)
     assert draw(scene(1), COLUMNS) != draw(scene(2), COLUMNS)
 
 

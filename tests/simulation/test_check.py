@@ -18,13 +18,12 @@ from zbridge.fleet.messages import Drive, Switch
 from zbridge.protocol.plugin import Outcome, Protocol, Simulation
 from zbridge.protocol.session import Session
 from zbridge.simulation import check as kit
+from zbridge.simulation.check import check_plugin
 from zbridge.simulation.check_commands import check_commands, check_stop
 from zbridge.simulation.check_messages import check_messages
 from zbridge.simulation.check_motion import check_motion
-from zbridge.simulation.check_plugin import check_plugin
-from zbridge.simulation.check_report import Finding
 from zbridge.simulation.check_sessions import check_sessions
-from zbridge.simulation.check_stage import Recording, record
+from zbridge.simulation.check_stage import CheckFinding, Transcript, record
 
 TOY: Protocol = toy.PROTOCOL
 
@@ -38,16 +37,16 @@ def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="module")
-def heard() -> Recording:
+def heard() -> Transcript:
     """What the sound robot says."""
     return asyncio.run(record(TOY, 5.0))
 
 
-def failed(findings: Iterable[Finding]) -> dict[str, str]:
+def failed(findings: Iterable[CheckFinding]) -> dict[str, str]:
     return {finding.claim: finding.problem for finding in findings if finding.problem is not None}
 
 
-def assert_found(findings: Iterable[Finding], expected: dict[str, str]) -> None:
+def assert_found(findings: Iterable[CheckFinding], expected: dict[str, str]) -> None:
     """Each claim with these words failed for a problem that says so, and no other claim failed."""
     found = failed(findings)
     for claim, problem in expected.items():
@@ -219,11 +218,11 @@ TRANSLATED = "messages of the robot are translated"
     ],
     ids=claims,
 )
-def test_a_session_that_breaks_is_found(heard: Recording, protocol: Protocol, expected: dict[str, str]) -> None:
+def test_a_session_that_breaks_is_found(heard: Transcript, protocol: Protocol, expected: dict[str, str]) -> None:
     assert_found(check_sessions(protocol, heard), expected)
 
 
-def test_a_silent_robot_and_requests_without_an_answer_are_found(heard: Recording) -> None:
+def test_a_silent_robot_and_requests_without_an_answer_are_found(heard: Transcript) -> None:
     lacking = msgspec.structs.replace(heard, messages=[], unanswered=3)
     expected = {"0 messages": "the simulated robot sent none", "the simulated robot answers": "3 had no answer"}
     assert_found(check_sessions(TOY, lacking), expected)
@@ -263,7 +262,7 @@ STILL = b"go 0.000000 0.000000\n"
     ],
     ids=["sound", "nothing", "last", "after what waits", "once", "beside the motion"],
 )
-def test_a_stop_that_is_not_first_or_does_not_last_is_found(heard: Recording, stop, expected: dict[str, str]) -> None:
+def test_a_stop_that_is_not_first_or_does_not_last_is_found(heard: Transcript, stop, expected: dict[str, str]) -> None:
     assert_found(check_stop(with_robot(stop=stop), heard), expected)
 
 
@@ -289,7 +288,7 @@ def only_drives(self: Any, topic: Any, command: Any, now: float) -> Outcome:
     ],
     ids=claims,
 )
-def test_a_command_that_is_neither_carried_out_nor_refused_is_found(heard: Recording, methods, expected) -> None:
+def test_a_command_that_is_neither_carried_out_nor_refused_is_found(heard: Transcript, methods, expected) -> None:
     assert_found(check_commands(with_robot(**methods), heard), expected)
 
 
@@ -353,7 +352,11 @@ def test_the_whole_check_passes_for_a_sound_protocol(monkeypatch, capsys) -> Non
 
 
 def test_what_does_not_hold_is_printed_and_is_the_exit_status(monkeypatch, capsys) -> None:
-    findings = [Finding("one"), Finding("two", "it does not"), Finding.of("three", ["a", "b", "c", "d"], "tried")]
+    findings = [
+        CheckFinding("one"),
+        CheckFinding("two", "it does not"),
+        CheckFinding.of("three", ["a", "b", "c", "d"], "tried"),
+    ]
     monkeypatch.setattr(kit, "find_protocol", lambda name: TOY)
     monkeypatch.setattr(kit, "check", lambda protocol, name: findings)
     assert kit.main(["toy"]) == 1

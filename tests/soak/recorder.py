@@ -12,7 +12,7 @@ from collections import Counter
 from pathlib import Path
 
 from tests.e2e.processes import ROOT, Part
-from zbridge.views.recording.reader import Reader
+from zbridge.views.recording.reader import RecordingReader
 
 DISK = "3m"
 END_S = 60.0
@@ -76,7 +76,7 @@ class Recorder:
         if process.returncode != code:
             self.faults.append(f"the recorder ({how}) ended with {process.returncode}: {said}")
         with self._file.open("rb") as file:
-            reader = Reader(file)
+            reader = RecordingReader(file)
             self.messages += sum(1 for _ in reader.messages())
             if reader.fault and (how != "killed" or not reader.fault.startswith("cut off")):
                 self.faults.append(f"a recording ({how}): {reader.fault}")

@@ -6,7 +6,7 @@ from typing import Any
 
 from google.protobuf import descriptor_pb2, descriptor_pool, json_format, message_factory
 
-from zbridge.views.pictures import Schema
+from zbridge.views.schemas import Schema
 
 
 def read(schema: Schema, payload: bytes) -> dict[str, Any]:

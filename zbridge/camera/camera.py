@@ -13,12 +13,10 @@ import time
 from collections.abc import Callable
 
 from zbridge.bus import Bus
-from zbridge.camera import jpeg
 from zbridge.camera.demand import Demand
-from zbridge.camera.latest import Latest
-from zbridge.camera.mjpeg import MjpegReader, Part
+from zbridge.camera.mjpeg import MjpegPart, MjpegReader, jpeg_size
 from zbridge.camera.pace import Pace
-from zbridge.camera.relay import Relay
+from zbridge.camera.relay import Latest, Relay
 from zbridge.camera.settings import CameraPlan
 from zbridge.camera.upstream import fetch
 from zbridge.control.context import Conditions
@@ -63,7 +61,7 @@ class Camera:
         if plan.relay is not None:
             self._relay = Relay(plan, plan.relay, demand, latest, metrics, lambda text: conditions.set(_RELAY, text))
         self._publisher = bus.publisher(self._key, topics.IMAGE)
-        self._pace: Pace[tuple[Part, int]] = Pace(plan.settings.rate_hz)
+        self._pace: Pace[tuple[MjpegPart, int]] = Pace(plan.settings.rate_hz)
         self._timer: asyncio.TimerHandle | None = None
         self._pictures = metrics.count("camera_pictures")
         self._rejected = metrics.count("camera_not_jpeg")
@@ -83,7 +81,7 @@ class Camera:
                 if self._relay is not None:
                     tasks.create_task(self._relay.run())
         finally:
-            self._rest()
+            self._reset()
             watch.close()
             self._publisher.close()
             for name in (_CONDITION, _RELAY):
@@ -98,7 +96,7 @@ class Camera:
             await self._demand.begin()
             begun = self._loop.time()
             reason = await self._fetch()
-            self._rest()
+            self._reset()
             if self._loop.time() - begun >= STEADY_S:
                 backoff.reset()
             if reason is None:
@@ -113,7 +111,7 @@ class Camera:
     async def _fetch(self) -> str | None:
         """Fetch until the stream ends; return why it ended. None: nobody watches any more."""
         log.info("camera %s: connecting", self._plan.source)
-        fetching = asyncio.create_task(fetch(self._plan.source, self._plan.settings.stall_s, self._take))
+        fetching = asyncio.create_task(fetch(self._plan.source, self._plan.settings.stall_s, self._receive))
         idle = asyncio.create_task(self._demand.end())
         try:
             await asyncio.wait((fetching, idle), return_when=asyncio.FIRST_COMPLETED)
@@ -127,7 +125,7 @@ class Camera:
         log.error("camera %s: %s", self._plan.source, describe(error), exc_info=error)
         return describe(error)
 
-    def _take(self, stream: MjpegReader, parts: list[Part]) -> None:
+    def _receive(self, stream: MjpegReader, parts: list[MjpegPart]) -> None:
         """Take the parts of one read, of which the newest counts."""
         self._rejected.value += stream.rejected
         if not parts:
@@ -149,7 +147,7 @@ class Camera:
         self._pace.dropped = 0
         if due is not None:
             part, stamp_ns = due
-            width, height = jpeg.size(part.jpeg) or (None, None)
+            width, height = jpeg_size(part.jpeg) or (None, None)
             image = Image(format="jpeg", data=part.jpeg, width=width, height=height, stamp_ns=stamp_ns)
             self._publisher.put(payloads.encode(image))
             self._published.value += 1
@@ -161,7 +159,7 @@ class Camera:
         self._timer = None
         self._publish()
 
-    def _rest(self) -> None:
+    def _reset(self) -> None:
         """Forget the pictures of a stream that has ended."""
         self._latest.forget()
         if self._timer is not None:

@@ -9,7 +9,7 @@ LINGER_S = 2.0
 
 
 class Demand:
-    """Tells whether anybody watches, and waits until somebody does or nobody does any more."""
+    """Knows whether anybody watches, and waits until somebody does or nobody does any more."""
 
     def __init__(self) -> None:
         self.listened = False
@@ -29,17 +29,17 @@ class Demand:
     def listen(self, anybody: bool) -> None:
         """Note that the first listener on the bus has come, or that the last one has gone."""
         self.listened = anybody
-        self._tell()
+        self._notify()
 
     def join(self) -> None:
         """Note one more client of the relay; :meth:`leave` must follow."""
         self.clients += 1
-        self._tell()
+        self._notify()
 
     def leave(self) -> None:
         """Note that a client of the relay has gone."""
         self.clients -= 1
-        self._tell()
+        self._notify()
 
     async def begin(self) -> None:
         """Wait until somebody watches."""
@@ -57,7 +57,7 @@ class Demand:
             except TimeoutError:
                 return
 
-    def _tell(self) -> None:
+    def _notify(self) -> None:
         self._changed.set()
         self._changed = asyncio.Event()
 

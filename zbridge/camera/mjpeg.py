@@ -18,6 +18,8 @@ after the delimiter that has to follow: a wrong length gives no broken picture.
 
 Cameras differ from RFC 2046: the parameter ``boundary`` may hold the dashes of the delimiter, no line break need stand
 before a delimiter or between it and the header, and lines may end with a bare LF.
+
+``is_jpeg``, ``is_whole`` and ``jpeg_size`` say what a JPEG's bytes tell without being decoded.
 """
 
 from __future__ import annotations
@@ -28,11 +30,49 @@ from enum import Enum
 
 import msgspec
 
-from zbridge.camera.jpeg import is_jpeg, is_whole
 from zbridge.errors import ProtocolError
 
+START = b"\xff\xd8\xff"
+"""How every JPEG begins: the marker SOI, and the first byte of the next marker."""
+END = b"\xff\xd9"
+"""How a whole JPEG ends: the marker EOI. Some cameras pad it with zeros or a line break."""
+_SEGMENTS = 64
+_SCAN, _ALONE = 0xDA, (0x01, *range(0xD0, 0xD9))
+_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+"""The markers SOF0 to SOF15: between them stand DHT, JPG and DAC."""
+
+
+def is_jpeg(data: bytes) -> bool:
+    """Tell whether the bytes begin as a JPEG does."""
+    return data.startswith(START)
+
+
+def is_whole(data: bytes) -> bool:
+    """Tell whether the bytes end as a JPEG does."""
+    return data[-64:].rstrip(b"\0\r\n").endswith(END)
+
+
+def jpeg_size(data: bytes) -> tuple[int, int] | None:
+    """Return width and height in pixels as the frame header says; None where none stands among the first segments."""
+    at = 2
+    for _ in range(_SEGMENTS):
+        if len(data) < at + 9 or data[at] != 0xFF:
+            return None
+        marker = data[at + 1]
+        if marker in _FRAMES:
+            height, width = int.from_bytes(data[at + 5 : at + 7], "big"), int.from_bytes(data[at + 7 : at + 9], "big")
+            return (width, height) if width and height else None
+        if marker == _SCAN:
+            return None
+        if marker == 0xFF:  # a fill byte
+            at += 1
+        else:
+            at += 2 if marker in _ALONE else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return None
+
+
 HEAD_BYTES = 16 * 1024
-"""Bound of the HTTP head, of what stands before the first part, and of a part's header."""
+"""Bound of the HTTP head, of what precedes the first part, and of a part's header."""
 PICTURE_BYTES = 4 * 1024 * 1024
 """Bound of one picture."""
 _BREAKS = 4
@@ -44,14 +84,14 @@ _LENGTH = re.compile(rb"[0-9]{1,9}")
 _KINDS = (b"image/jpeg", b"image/jpg", b"image/pjpeg")
 
 
-class Part(msgspec.Struct, frozen=True):
+class MjpegPart(msgspec.Struct, frozen=True):
     """One picture. head: delimiter and header as the camera wrote them, with the blank line."""
 
     head: bytes
     jpeg: bytes
 
 
-class Step(Enum):
+class MjpegStep(Enum):
     """What a reader waits for."""
 
     ANSWER = "the HTTP head"
@@ -72,20 +112,20 @@ class MjpegReader:
         self.head = self.boundary = b""
         self.ended = False
         self.rejected = 0
-        self.step = Step.ANSWER
+        self.step = MjpegStep.ANSWER
         self._delimiter = b""
         self._part_head = b""
         self._length = 0
         self._is_image = True
-        self._doubtful: Part | None = None
+        self._doubtful: MjpegPart | None = None
         self._buffer = bytearray()
         self._searched = self._breaks = 0
-        self._parts: list[Part] = []
+        self._parts: list[MjpegPart] = []
 
     def __repr__(self) -> str:
         return f"<MjpegReader waits for {self.step.value}, {len(self._buffer)} bytes>"
 
-    def receive(self, data: bytes) -> list[Part]:
+    def receive(self, data: bytes) -> list[MjpegPart]:
         """Take bytes; return the parts that are whole now. Raises ProtocolError."""
         self._buffer += data
         while not self.ended and _STEPS[self.step](self):
@@ -93,7 +133,7 @@ class MjpegReader:
         parts, self._parts = self._parts, []
         return parts
 
-    # One method for each step; True: it is done, go on with the next
+    # One method for each step; True: it is done, continue with the next
 
     def _read_answer(self) -> bool:
         head = self._take_head("an HTTP head")
@@ -114,7 +154,7 @@ class MjpegReader:
         boundary = _BOUNDARY.search(kind)
         if boundary is None:
             raise ProtocolError("the answer names no boundary")
-        self.head, self.boundary, self.step = head, boundary[1] or boundary[2], Step.FIRST
+        self.head, self.boundary, self.step = head, boundary[1] or boundary[2], MjpegStep.FIRST
         return True
 
     def _read_first(self) -> bool:
@@ -122,7 +162,7 @@ class MjpegReader:
         for delimiter in written:
             at = self._buffer.find(delimiter)
             if at >= 0:
-                self._delimiter, self.step = delimiter, Step.HEAD
+                self._delimiter, self.step = delimiter, MjpegStep.HEAD
                 self._drop(at)
                 return True
         if len(self._buffer) > HEAD_BYTES:
@@ -144,7 +184,7 @@ class MjpegReader:
         fields = _fields(head[len(self._delimiter) :])
         kind = fields.get(b"content-type", _KINDS[0]).partition(b";")[0].strip().lower()
         self._part_head, self._is_image, self._length = head, kind in _KINDS, _length(fields)
-        self.step = Step.OPEN if self._length < 0 else Step.SIZED
+        self.step = MjpegStep.OPEN if self._length < 0 else MjpegStep.SIZED
         return True
 
     def _read_sized(self) -> bool:
@@ -192,13 +232,13 @@ class MjpegReader:
         return True
 
     def _finish(self, jpeg: bytes, *, followed: bool) -> None:
-        self.step, self._breaks = Step.HEAD, 0
+        self.step, self._breaks = MjpegStep.HEAD, 0
         if not (self._is_image and is_jpeg(jpeg)):
             self.rejected += 1
         elif followed or is_whole(jpeg):
-            self._parts.append(Part(self._part_head, jpeg))
+            self._parts.append(MjpegPart(self._part_head, jpeg))
         else:
-            self._doubtful = Part(self._part_head, jpeg)
+            self._doubtful = MjpegPart(self._part_head, jpeg)
 
     def _take_head(self, what: str) -> bytes | None:
         """Take all bytes through the next blank line; None: it has not come yet."""
@@ -240,10 +280,10 @@ def _length(fields: dict[bytes, bytes]) -> int:
     return int(text)
 
 
-_STEPS: dict[Step, Callable[[MjpegReader], bool]] = {
-    Step.ANSWER: MjpegReader._read_answer,
-    Step.FIRST: MjpegReader._read_first,
-    Step.HEAD: MjpegReader._read_head,
-    Step.SIZED: MjpegReader._read_sized,
-    Step.OPEN: MjpegReader._read_open,
+_STEPS: dict[MjpegStep, Callable[[MjpegReader], bool]] = {
+    MjpegStep.ANSWER: MjpegReader._read_answer,
+    MjpegStep.FIRST: MjpegReader._read_first,
+    MjpegStep.HEAD: MjpegReader._read_head,
+    MjpegStep.SIZED: MjpegReader._read_sized,
+    MjpegStep.OPEN: MjpegReader._read_open,
 }

@@ -12,16 +12,16 @@ PICTURES_S = 240
 """Pictures a second that are read from a camera; one that sends more waits."""
 
 
-class Budget:
+class ReadBudget:
     """Bounds what a camera costs: tells how long to read nothing after what was read. A second of it may be saved."""
 
     def __init__(self) -> None:
         self._paid_until = 0.0
 
     def __repr__(self) -> str:
-        return f"<Budget used until {self._paid_until:g}>"
+        return f"<ReadBudget used until {self._paid_until:g}>"
 
-    def rest_s(self, size: int, pictures: int, now: float) -> float:
+    def pause_s(self, size: int, pictures: int, now: float) -> float:
         """Count bytes and pictures that were read; return for how long nothing is to be read, seconds."""
         self._paid_until = max(self._paid_until, now - 1.0) + max(size / BYTES_S, pictures / PICTURES_S)
         return max(0.0, self._paid_until - now)

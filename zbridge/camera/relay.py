@@ -2,8 +2,8 @@
 
 Deployed programs read multipart naively. So they get what the camera itself wrote: its HTTP head, and of each picture
 the delimiter and header, byte for byte and in their order. Each client has a task of its own that sends the newest
-picture, waits until the socket has taken it, and goes on with the newest then: a slow client sees fewer pictures and
-holds nobody up. Clients are accepted one by one, bounded in number; refused ones are closed at most 100 a second.
+picture, waits until the socket has accepted it, and continues with the newest then: a slow client sees fewer pictures
+and delays nobody. Clients are accepted one by one, bounded in number; refused ones are closed at most 100 a second.
 """
 
 from __future__ import annotations
@@ -14,8 +14,10 @@ import logging
 import socket
 from collections.abc import Callable
 
+import msgspec
+
 from zbridge.camera.demand import Demand
-from zbridge.camera.latest import Latest
+from zbridge.camera.mjpeg import MjpegPart, MjpegReader
 from zbridge.camera.settings import CameraPlan
 from zbridge.camera.upstream import explain
 from zbridge.metrics import Metrics
@@ -23,6 +25,45 @@ from zbridge.protocol.address import Address
 from zbridge.protocol.networks import is_among
 from zbridge.protocol.session_table import Backoff
 from zbridge.transport.waiting import waiting_sockets
+
+
+class Shot(msgspec.Struct, frozen=True):
+    """One picture, and the stream it belongs to: ``answer`` is that stream's HTTP head. number: rises by one."""
+
+    number: int
+    answer: bytes
+    boundary: bytes
+    part: MjpegPart
+
+
+class Latest:
+    """Keeps the newest picture only; a client waits for one that is newer than the last it got."""
+
+    def __init__(self) -> None:
+        self._number = 0
+        self._shot: Shot | None = None
+        self._came = asyncio.Event()
+
+    def __repr__(self) -> str:
+        return f"<Latest {self._number}>"
+
+    def show(self, stream: MjpegReader, part: MjpegPart) -> None:
+        """Replace the picture by a newer one."""
+        self._number += 1
+        self._shot = Shot(self._number, stream.head, stream.boundary, part)
+        self._came.set()
+        self._came = asyncio.Event()
+
+    def forget(self) -> None:
+        """Keep no picture: the stream has ended, and what it showed is old."""
+        self._shot = None
+
+    async def after(self, number: int) -> Shot:
+        """Return the newest picture as soon as its number is greater than ``number``."""
+        while self._shot is None or self._shot.number <= number:
+            await self._came.wait()
+        return self._shot
+
 
 log = logging.getLogger("zbridge.camera")
 
@@ -42,7 +83,7 @@ _FORBIDDEN = b"HTTP/1.0 403 Forbidden\r\nContent-Length: 0\r\n\r\n"
 
 
 class Relay:
-    """Listens at ``address`` until cancelled. tell: shows people why it does not listen; None: it does."""
+    """Listens at ``address`` until cancelled. report: shows people why it does not listen; None: it does."""
 
     def __init__(
         self,
@@ -51,14 +92,14 @@ class Relay:
         demand: Demand,
         latest: Latest,
         metrics: Metrics,
-        tell: Callable[[str | None], object],
+        report: Callable[[str | None], object],
     ) -> None:
         self._address = address
         self._allow = plan.allow
         self._most = plan.settings.clients
         self._demand = demand
         self._latest = latest
-        self._tell = tell
+        self._report = report
         self._clients: set[asyncio.Task[None]] = set()
         self._accepted = metrics.count("camera_relay_accepted")
         self._refused = metrics.count("camera_relay_refused")
@@ -75,10 +116,10 @@ class Relay:
             try:
                 sockets = await waiting_sockets(self._address)
             except OSError as error:
-                self._tell(f"camera relay {self._address.host}:{self._address.port}: {explain(error)}")
+                self._report(f"camera relay {self._address.host}:{self._address.port}: {explain(error)}")
                 await asyncio.sleep(backoff.delay_s())
                 continue
-            self._tell(None)
+            self._report(None)
             log.info("camera: HQ programs find %s at %s", PATH.decode(), self._address)
             try:
                 async with asyncio.TaskGroup() as tasks:
@@ -98,7 +139,7 @@ class Relay:
                 log.debug("camera relay: %s", error)
                 await asyncio.sleep(1.0)
                 continue
-            if len(self._clients) >= self._most or not self._admits(peer[0]):
+            if len(self._clients) >= self._most or (self._allow and not is_among(peer[0], self._allow)):
                 self._refused.value += 1
                 client.close()
                 await asyncio.sleep(_REFUSAL_S)
@@ -107,9 +148,6 @@ class Relay:
             task = asyncio.create_task(self._serve(client))
             self._clients.add(task)
             task.add_done_callback(self._clients.discard)
-
-    def _admits(self, host: str) -> bool:
-        return not self._allow or is_among(host, self._allow)
 
     async def _serve(self, client: socket.socket) -> None:
         """Answer one client, and give it pictures until it goes or takes none."""

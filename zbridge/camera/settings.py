@@ -32,7 +32,7 @@ class CameraSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     allow: tuple[str, ...] = ()
 
 
-class Source(msgspec.Struct, frozen=True):
+class CameraSource(msgspec.Struct, frozen=True):
     """Where a camera streams. target: path and query, as the request names them."""
 
     host: str
@@ -52,7 +52,7 @@ class Source(msgspec.Struct, frozen=True):
 class CameraPlan(msgspec.Struct, frozen=True):
     """What a camera is made of. relay: where its relay listens; None: nowhere."""
 
-    source: Source
+    source: CameraSource
     settings: CameraSettings
     relay: Address | None = None
     allow: tuple[Network, ...] = ()
@@ -67,7 +67,7 @@ def plan_camera(settings: CameraSettings) -> CameraPlan:
     return CameraPlan(_source(settings.url), settings, relay, allow)
 
 
-def _source(url: str) -> Source:
+def _source(url: str) -> CameraSource:
     try:
         parts = urlsplit(url)
         host, port = parts.hostname, parts.port
@@ -78,7 +78,7 @@ def _source(url: str) -> Source:
     odd = parts.fragment or parts.username is not None or not _TARGET.fullmatch(url)
     if parts.scheme != "http" or not host or port == 0 or odd:
         raise ConfigError(f"camera.url = {url!r}: {_EXPECTED}")
-    return Source(host, port or 80, target)
+    return CameraSource(host, port or 80, target)
 
 
 def _relay(text: str) -> Address:

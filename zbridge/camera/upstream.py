@@ -12,29 +12,29 @@ import os
 import socket
 from collections.abc import Callable
 
-from zbridge.camera.mjpeg import MjpegReader, Part
-from zbridge.camera.pace import Budget
-from zbridge.camera.settings import Source
+from zbridge.camera.mjpeg import MjpegPart, MjpegReader
+from zbridge.camera.pace import ReadBudget
+from zbridge.camera.settings import CameraSource
 from zbridge.errors import LinkError
 
 CONNECT_S = 5.0
-"""Longest time until the connection stands."""
+"""Longest time until the connection is established."""
 _READ_BYTES = 64 * 1024
 
-Took = Callable[[MjpegReader, list[Part]], None]
+OnParts = Callable[[MjpegReader, list[MjpegPart]], None]
 """Called with the parts of one read, of which there may be none; ``rejected`` counts those of this read left out."""
 
 
-async def fetch(source: Source, stall_s: float, took: Took) -> None:
+async def fetch(source: CameraSource, stall_s: float, on_parts: OnParts) -> None:
     """Fetch a stream and give its pictures until it ends, which always raises: LinkError or ProtocolError.
 
     A stream that brings no whole picture for ``stall_s`` seconds is ended. One that sends more than a camera does is
-    read more slowly (:class:`Budget`).
+    read more slowly (:class:`ReadBudget`).
     """
     reader, writer = await _connect(source)
     try:
         writer.write(_request(source))
-        await _read(reader, stall_s, took)
+        await _read(reader, stall_s, on_parts)
     except OSError as error:
         raise LinkError(explain(error)) from error
     finally:
@@ -47,7 +47,7 @@ def explain(error: OSError) -> str:
     return os.strerror(error.errno) if known and error.errno is not None else error.strerror or str(error)
 
 
-async def _connect(source: Source) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+async def _connect(source: CameraSource) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
     try:
         async with asyncio.timeout(CONNECT_S):
             return await asyncio.open_connection(source.host, source.port)
@@ -57,14 +57,14 @@ async def _connect(source: Source) -> tuple[asyncio.StreamReader, asyncio.Stream
         raise LinkError(explain(error)) from error
 
 
-def _request(source: Source) -> bytes:
+def _request(source: CameraSource) -> bytes:
     lines = (f"GET {source.target} HTTP/1.0", f"Host: {source.authority}", "User-Agent: zbridge", "", "")
     return "\r\n".join(lines).encode("ascii")
 
 
-async def _read(reader: asyncio.StreamReader, stall_s: float, took: Took) -> None:
+async def _read(reader: asyncio.StreamReader, stall_s: float, on_parts: OnParts) -> None:
     """Read until the stream ends. What is read at once is not timed by ``timeout_at``: the deadline is checked too."""
-    loop, mjpeg, budget = asyncio.get_running_loop(), MjpegReader(), Budget()
+    loop, mjpeg, budget = asyncio.get_running_loop(), MjpegReader(), ReadBudget()
     deadline, stalled = loop.time() + stall_s, LinkError(f"no picture for {stall_s:g} s")
     while not mjpeg.ended:
         try:
@@ -76,14 +76,14 @@ async def _read(reader: asyncio.StreamReader, stall_s: float, took: Took) -> Non
             break
         parts = mjpeg.receive(data)
         now = loop.time()
-        rest_s = budget.rest_s(len(data), len(parts) + mjpeg.rejected, now)
-        took(mjpeg, parts)
+        pause_s = budget.pause_s(len(data), len(parts) + mjpeg.rejected, now)
+        on_parts(mjpeg, parts)
         mjpeg.rejected = 0
         if parts:
-            await asyncio.sleep(min(rest_s, stall_s))
+            await asyncio.sleep(min(pause_s, stall_s))
             deadline = loop.time() + stall_s
         else:
-            await asyncio.sleep(max(0.0, min(rest_s, deadline - now)))
+            await asyncio.sleep(max(0.0, min(pause_s, deadline - now)))
             if loop.time() >= deadline:
                 raise stalled
     raise LinkError("the stream ended")

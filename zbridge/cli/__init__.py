@@ -2,11 +2,11 @@
 unlatch, restart, certs, record, info, export, mark, replay, ros2``.
 
 Knows no protocol. Only this package imports typer and rich, and this module does not: ``zbridge run`` loads neither.
-``app`` declares the commands, ``certs``, ``robots`` and ``recordings`` do for groups of them; ``bus``,
-``demo`` (with ``secure_demo`` and ``processes``), ``drive``, ``foxglove``, ``health``, ``probe``, ``recorded``,
-``replayed``, ``restart``, ``ros2``, ``router``, ``stops`` and ``supervise`` carry theirs out, ``keyboard`` turns keys
-into drives, ``fork_server`` is the process that gateways of ``zbridge run DIR`` are forked from. Exit codes: 0 done, 1
-failed, 2 wrong arguments or configuration; those of ``health`` are for monitoring programs.
+``app`` declares the commands; ``certs``, ``robot_commands`` and ``recording_commands`` declare groups of them. ``bus``,
+``demo`` (with ``demo_bus``), ``drive``, ``gateway_commands``, ``probe``, ``recording``, ``router``, ``supervise`` and
+``viewers`` carry them out. ``keyboard`` turns keys into drives, ``fork_server`` is the process that gateways of
+``zbridge run DIR`` are forked from. Exit codes: 0 done, 1 failed, 2 wrong arguments or configuration; those of
+``health`` are for monitoring programs.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from zbridge.errors import ConfigError, ZbridgeError
 from zbridge.fleet.printable import shown
 
 if TYPE_CHECKING:  # loaded where there is a supervisor only
+    from zbridge.app.config import Plan
     from zbridge.app.supervisor.child import Reporter
 
 
@@ -89,14 +90,7 @@ def run_gateway(
         set_up_log(verbose=verbose)
     plan = load(file, tls=tls, content=content)
     hand_on_tls(tls)
-    parts = {"device": plan.device} if plan.device else {f"hq[{n}]": part for n, part in enumerate(plan.listeners)}
-    for key, part in parts.items():
-        if only is not None and part.protocol.name != only:
-            raise ConfigError(f"{file}: {key}.protocol = {part.protocol.name!r}: expected {only!r}")
-    try:
-        check_member(plan)
-    except ConfigError as error:
-        raise ConfigError(f"{file}: {error}") from error
+    _check(plan, file, only)
     gc.freeze()  # objects made at start-up live as long as the process; the collector skips them
     predecessor = socket.socket(fileno=take_over) if take_over is not None else None
     successor = reporter if reporter is not None else Spawn(file, verbose=verbose)
@@ -118,7 +112,23 @@ def run_gateway(
         raise ConfigError(f"{file}: {error}") from error
     if gateway.restarts.gone.is_set() and isinstance(successor, Spawn):
         successor.tell_systemd()
-    if not gateway.left:  # a thread of the bus hangs and would keep the process alive
+    _exit(left=gateway.left)
+
+
+def _check(plan: Plan, file: Path, only: str | None) -> None:
+    parts = {"device": plan.device} if plan.device else {f"hq[{n}]": part for n, part in enumerate(plan.listeners)}
+    for key, part in parts.items():
+        if only is not None and part.protocol.name != only:
+            raise ConfigError(f"{file}: {key}.protocol = {part.protocol.name!r}: expected {only!r}")
+    try:
+        check_member(plan)
+    except ConfigError as error:
+        raise ConfigError(f"{file}: {error}") from error
+
+
+def _exit(*, left: bool) -> None:
+    """End the process where the bus was not left: one of its threads hangs and would keep the process alive."""
+    if not left:
         logging.shutdown()
         os._exit(0)
 
@@ -149,9 +159,7 @@ def run_together(files: Sequence[Path], host: HostSettings, *, verbose: bool = F
     gc.freeze()
     together = Together({plan.config.robot.name: plan for _, plan in plans}, host)
     run_loop(until_signal(together.run()))
-    if not together.left:
-        logging.shutdown()
-        os._exit(0)
+    _exit(left=together.left)
 
 
 def run_loop(work: Coroutine[Any, Any, Any]) -> Any:

@@ -15,7 +15,17 @@ from zbridge.app.host import HostSettings, load_host, robot_files
 from zbridge.app.member import check_member, not_checked
 from zbridge.app.tasks import together
 from zbridge.bus.tls.files import ends_soon, out_of_date, utc_now
-from zbridge.cli import certs, give_up, hand_on_tls, recordings, robots, run_gateway, run_loop, run_together, set_up_log
+from zbridge.cli import (
+    certs,
+    give_up,
+    hand_on_tls,
+    recording_commands,
+    robot_commands,
+    run_gateway,
+    run_loop,
+    run_together,
+    set_up_log,
+)
 from zbridge.cli.options import Connect, FileTls, Realm, TlsFolder, check_name
 from zbridge.client import bus_settings
 from zbridge.errors import ConfigError
@@ -32,14 +42,27 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.add_typer(certs.app, name="certs")
-app.add_typer(robots.app)
-app.add_typer(recordings.app)
+app.add_typer(robot_commands.app)
+app.add_typer(recording_commands.app)
 
 File = Annotated[Path, typer.Argument(help="a gateway's configuration (TOML)", show_default=False)]
 Files = Annotated[
     list[Path], typer.Argument(help="a gateway's configuration (TOML), several, or a directory", show_default=False)
 ]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="log every frame")]
+SimulatedAt = Annotated[
+    list[str],
+    typer.Option(
+        help="address to listen at, tcp://host:port; port 0: any free one; once for each link. "
+        "By default where `zbridge init` expects a robot"
+    ),
+]
+ServedBy = Annotated[
+    str, typer.Option(help="be an HQ program instead, as fragile as deployed ones, and connect to this address")
+]
+Drives = Annotated[
+    str, typer.Option(help="with --hq: drive FORWARD or FORWARD,TURN, fractions of full scale: 0.3 or 0.3,-0.2")
+]
 
 
 @app.command()
@@ -127,19 +150,9 @@ def init(
 @app.command()
 def simulate(
     protocol: Annotated[str, typer.Argument(help="one of: " + ", ".join(protocol_names()), show_default=False)],
-    listen: Annotated[
-        list[str],
-        typer.Option(
-            help="address to listen at, tcp://host:port; port 0: any free one; once for each link. "
-            "By default where `zbridge init` expects a robot"
-        ),
-    ] = [],
-    hq: Annotated[
-        str, typer.Option(help="be an HQ program instead, as fragile as deployed ones, and connect to this address")
-    ] = "",
-    drive: Annotated[
-        str, typer.Option(help="with --hq: drive FORWARD or FORWARD,TURN, fractions of full scale: 0.3 or 0.3,-0.2")
-    ] = "",
+    listen: SimulatedAt = [],
+    hq: ServedBy = "",
+    drive: Drives = "",
     seed: Annotated[int, typer.Option(help="the same seed makes the same world")] = 1,
     version: Annotated[str, typer.Option(help="version of the protocol; the newest common one by default")] = "",
     dialect: Annotated[str, typer.Option(help="dialect of the protocol, where it has several")] = "",

@@ -1,4 +1,4 @@
-"""``zbridge ls, echo``: the commands that read the bus."""
+"""``zbridge ls, health, echo``: the commands that read the bus."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from rich.text import Text
 from zbridge.bus import Bus, BusSettings, Sample, open_bus, read_key_expr
 from zbridge.bus.tls.refusal import why_not
 from zbridge.client import connect
-from zbridge.errors import ConfigError, PayloadError
+from zbridge.client.health import Health, HealthLevel, health
+from zbridge.errors import BusError, ConfigError, PayloadError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import FleetMessage, SessionEntry, Status
@@ -91,18 +92,8 @@ async def list_sessions(settings: BusSettings, realm: str, *, as_json: bool) -> 
 
 def _session_table(tables: dict[tuple[str, str], tuple[SessionEntry, ...]]) -> Table:
     titles = (
-        "robot",
-        "process",
-        "session",
-        "peer",
-        "state",
-        "version",
-        "by",
-        "in",
-        "out",
-        "lost",
-        "left out",
-        "reason",
+        *("robot", "process", "session", "peer", "state", "version"),
+        *("by", "in", "out", "lost", "left out", "reason"),
     )
     table = Table(box=None)
     for title in titles:
@@ -151,43 +142,41 @@ def _summary(robots: dict[str, Status | None]) -> str:
     return f"{len(robots)} robots: " + ", ".join(f"{count} {state}" for state, count in counts.most_common())
 
 
-class EchoOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """What ``zbridge echo`` prints. realm: None takes that of the key. count, seconds: end after so many, 0 = never."""
+async def echo(
+    settings: BusSettings,
+    key: str,
+    *,
+    realm: str | None = None,
+    as_json: bool = False,
+    count: int = 0,
+    seconds: float = 0.0,
+) -> bool:
+    """Print the messages on a key, the last value of each state first. realm: None takes that of the key.
 
-    key: str
-    realm: str | None = None
-    as_json: bool = False
-    count: int = 0
-    seconds: float = 0.0
-
-
-async def echo(settings: BusSettings, options: EchoOptions) -> bool:
-    """Print the messages on a key, the last value of each state first.
-
-    Return False if ``seconds`` passed with fewer messages than ``count``, or with none. Raise ConfigError for what is
-    no key expression, or none of the realm.
+    count, seconds: end after so many, 0 = never. Return False if ``seconds`` passed with fewer messages than ``count``,
+    or with none. Raise ConfigError for what is no key expression, or none of the realm.
     """
-    key = read_key_expr("KEY", options.key)
-    count, seen, done = options.count, 0, asyncio.Event()
-    realm = _realm_of(key, options.realm)
+    key = read_key_expr("KEY", key)
+    seen, done = 0, asyncio.Event()
+    realm = _realm_of(key, realm)
 
     def show(sample: Sample) -> None:
         nonlocal seen
         if count and seen >= count:
             return
         seen += 1
-        console.print(_line(sample, as_json=options.as_json))
+        console.print(_line(sample, as_json=as_json))
         if seen == count:
             done.set()
 
     async with joined(settings, realm) as bus:
         bus.subscribe(key, show, history=True)
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(options.seconds or None):
+            async with asyncio.timeout(seconds or None):
                 await done.wait()
     if seen and seen >= count:
         return True
-    errors.print(shown(f"{seen or 'no'} messages on {key} within {options.seconds:g} s"))
+    errors.print(shown(f"{seen or 'no'} messages on {key} within {seconds:g} s"))
     return False
 
 
@@ -251,3 +240,42 @@ def _plain(value: Any, depth: int = _DEPTH) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value if value is None or isinstance(value, str | int) else str(value)
+
+
+_NAMED_ILL = 5
+"""Robots that the line names."""
+_REASON = 120
+"""Characters of a reason that the line shows."""
+
+
+async def report_health(settings: BusSettings, realm: str, robot: str | None, *, as_json: bool) -> int:
+    """Print how one robot is, or all of them; return the exit code: 0 ok, 1 warning, 2 critical."""
+    try:
+        async with connect(settings=settings, realm=realm) as fleet:
+            robots = await health(fleet, robot)
+        trouble = None if robots else f"no robots on {realm}/"
+    except BusError as error:
+        robots, trouble = {}, f"no bus: {error}"
+    level = HealthLevel.CRITICAL if trouble is not None else max(each.level for each in robots.values())
+    line = f"{level.name} - {trouble or _health_line(robots)}"
+    if as_json:
+        fields = {
+            name: {**msgspec.to_builtins(each), "level": each.level.name.lower()} for name, each in robots.items()
+        }
+        console.print(to_json({"level": level.name.lower(), "text": line, "robots": fields}))
+    else:
+        console.print(line)
+    return int(level)
+
+
+def _health_line(robots: dict[str, Health]) -> str:
+    """Count the robots that are well, and name the worst of the others with their reasons."""
+    ill = sorted((name for name, each in robots.items() if each.level), key=lambda name: -robots[name].level)
+    parts = [f"{len(robots) - len(ill)} of {len(robots)} robots established"]
+    parts += [f"{name} {_trouble(robots[name])}" for name in ill[:_NAMED_ILL]]
+    parts += [f"and {len(ill) - _NAMED_ILL} more"] * (len(ill) > _NAMED_ILL)
+    return "; ".join(parts)
+
+
+def _trouble(each: Health) -> str:
+    return shown(": ".join(filter(None, (each.state or "is missing", each.reason))), _REASON)

@@ -1,6 +1,6 @@
 """``zbridge demo``: a simulated robot of each protocol, their gateways, a router, a table. Loopback only.
 
-Here the bus is open to all of this machine, and its router embedded; ``secure_demo`` makes one with roles.
+Here the bus is open to all of this machine, and its router embedded; ``demo_bus`` makes one with roles.
 """
 
 from __future__ import annotations
@@ -26,8 +26,7 @@ from rich.table import Table
 from zbridge.app import until_signal
 from zbridge.bus import BusSettings, Sample, open_bus
 from zbridge.cli.bus import cell
-from zbridge.cli.processes import end, free_port, process
-from zbridge.cli.secure_demo import REALM, START_S, DemoBus, secure_bus
+from zbridge.cli.demo_bus import REALM, START_S, DemoBus, end, free_port, process, secure_bus
 from zbridge.client import LOCAL_ROUTER, Fleet, Robot
 from zbridge.errors import BusError, ConfigError, LeaseLost, NeutralFirst, NotReady, PayloadError, Refused, ZbridgeError
 from zbridge.fleet import payload as payloads
@@ -54,7 +53,7 @@ class Row(msgspec.Struct):
     status: Status | None = None
     control: Control | None = None
     pose: Pose | None = None
-    heard: bool = False
+    received: bool = False
     counts: Counter[str] = msgspec.field(default_factory=Counter)
 
 
@@ -71,7 +70,7 @@ class Watch:
         if split is None or row is None:
             return
         row.counts[split[2].partition("/")[0]] += 1
-        row.heard = row.heard or split[2] not in _NO_DATA
+        row.received = row.received or split[2] not in _NO_DATA
         with contextlib.suppress(PayloadError):
             if split[2] == topics.STATUS.path:
                 row.status = payloads.decode(Status, sample.payload)
@@ -118,24 +117,24 @@ async def run_demo(seconds: float, *, secure: bool = False) -> None:
                 failed.append(_left_out(error))
                 del watch.rows[robot]
         for key_expr in ("*", "sensor/*"):
-            bus.looking.subscribe(f"{REALM}/*/{key_expr}", watch.take)
+            bus.viewer.subscribe(f"{REALM}/*/{key_expr}", watch.take)
         how = [
             f"router at {bus.endpoint}; try, in another terminal:",
             *(f"  {line}" for line in bus.commands),
             "HQ programs connect to the robots here; to simulate one:",
             *(f"  {name}: {_how_to_connect(find_protocol(robots[name]), listeners[name])}" for name in watch.rows),
         ]
-        await until_signal(_show(bus.driving, watch, seconds, how))
+        await until_signal(_show(bus.operator, watch, seconds, how))
         await end([gateway for _, gateway in processes])  # all at once: each needs about a second to stop its robot
         await end([simulator for simulator, _ in processes])
-        failed += [f"no data from {robot}" for robot, row in watch.rows.items() if not row.heard]
+        failed += [f"no data from {robot}" for robot, row in watch.rows.items() if not row.received]
         if seconds and failed:
             _print_end(folder / "log")
             raise ZbridgeError(f"{'; '.join(failed)}; the end of the processes' log is above")
 
 
 def _left_out(error: ZbridgeError) -> str:
-    """Print why the demo goes on without a protocol; return it."""
+    """Print why the demo continues without a protocol; return it."""
     print(shown(f"zbridge: {error}; the demo goes on without it"), file=sys.stderr)  # noqa: T201
     return str(error)
 

@@ -87,13 +87,7 @@ async def _talk(protocol: Protocol, address: DeviceAddress) -> int:
         return 1
     finally:
         established, seen = session.version is not None, session.snapshot()
-        conversation.close("probed")
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(1.0):
-                await asyncio.shield(conversation.ended)
-        conversation.abandon()
-        if link is not None:
-            await link.ended()
+        await _hang_up(conversation, link)
     _show(
         {
             "protocol": protocol.name,
@@ -106,6 +100,16 @@ async def _talk(protocol: Protocol, address: DeviceAddress) -> int:
         }
     )
     return 0 if established else 1
+
+
+async def _hang_up(conversation: Conversation, link: Link | None) -> None:
+    conversation.close("probed")
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(1.0):
+            await asyncio.shield(conversation.ended)
+    conversation.abandon()
+    if link is not None:
+        await link.ended()
 
 
 def _show(fields: dict[str, object]) -> None:

@@ -1,9 +1,9 @@
 """What ROS 2's middleware rmw_zenoh puts on Zenoh: keys, tokens, attachments, type hashes and CDR. Sans-IO.
 
 Knows no robot, no bus and no fleet message: a view (``zbridge.views``) and a protocol (``gateways``) read and write the
-same format. ``names`` writes keys, ``tokens`` writes and reads what makes nodes and endpoints visible, ``attachment``
-what stands beside each sample, ``types`` hashes, writes and reads messages (rosbags, the extra ``zbridge[ros2]``,
-loaded with the first store of types). Source of the format: rmw_zenoh_cpp 0.12.0.
+same format. ``rmw_zenoh`` writes keys, and writes and reads liveliness tokens and attachments; ``types`` hashes, writes
+and reads messages (rosbags, the extra ``zbridge[ros2]``, loaded with the first store of types).
+Source of the format: rmw_zenoh_cpp 0.12.0.
 
 A sample of a topic is put on :func:`topic_key`, its payload CDR, its attachment :class:`Attachment` with the gid of its
 publisher's token. A service is a queryable, complete, on the same kind of key with the service's type and hash; a
@@ -12,10 +12,30 @@ request is a query whose attachment has the client's gid and a number from 1, an
 
 from __future__ import annotations
 
-from zbridge.ros2.attachment import Attachment, read_attachment
-from zbridge.ros2.names import dds_type, is_ros_name, ros_name, ros_type, topic_key
-from zbridge.ros2.qos import KEEP_LAST_10, LATCHED, SENSOR_DATA, SERVICES, Durability, QoS, Reliability, read_qos
-from zbridge.ros2.tokens import Endpoint, Kind, Node, all_tokens, endpoints_of, gid_of, read_token
+from zbridge.ros2.rmw_zenoh import (
+    KEEP_LAST_10,
+    LATCHED,
+    SENSOR_DATA,
+    SERVICES,
+    Attachment,
+    Durability,
+    Endpoint,
+    Kind,
+    Node,
+    Reliability,
+    RosQoS,
+    all_tokens,
+    dds_type,
+    endpoints_of,
+    gid_of,
+    is_ros_name,
+    read_attachment,
+    read_qos,
+    read_token,
+    ros_name,
+    ros_type,
+    topic_key,
+)
 from zbridge.ros2.types import DISTROS, NO_HASH, Types, types_of
 
 __all__ = [
@@ -30,8 +50,8 @@ __all__ = [
     "Endpoint",
     "Kind",
     "Node",
-    "QoS",
     "Reliability",
+    "RosQoS",
     "Types",
     "all_tokens",
     "dds_type",

@@ -11,32 +11,35 @@ from __future__ import annotations
 import asyncio
 import logging
 import sys
-from collections.abc import Iterator
+import tomllib
+from collections.abc import Callable, Iterator
+
+import msgspec
 
 from zbridge.errors import ConfigError
+from zbridge.fleet.messages import SessionEntry
 from zbridge.protocol.plugin import Protocol, find_protocol
+from zbridge.protocol.session import Role
 from zbridge.simulation.check_commands import check_commands, check_stop
 from zbridge.simulation.check_messages import check_messages
 from zbridge.simulation.check_motion import check_motion
-from zbridge.simulation.check_plugin import check_plugin
-from zbridge.simulation.check_report import Finding
 from zbridge.simulation.check_sessions import check_sessions
-from zbridge.simulation.check_stage import Recording, record
+from zbridge.simulation.check_stage import CheckFinding, Transcript, record, robot_of
 
 USAGE = "usage: python -m zbridge.simulation.check NAME\n"
 ESTABLISH_S = 10.0
 """Seconds that a session with the simulated robot has to be established."""
 
 
-def check(protocol: Protocol, name: str, *, establish_s: float = ESTABLISH_S) -> Iterator[Finding]:
+def check(protocol: Protocol, name: str, *, establish_s: float = ESTABLISH_S) -> Iterator[CheckFinding]:
     """Check a protocol, installed as ``name``; yield what holds and what does not, in the order of the checks."""
     yield from check_plugin(protocol, name)
     yield from check_messages(protocol)
-    recording = Recording()
+    recording = Transcript()
     try:
         recording = asyncio.run(record(protocol, establish_s))
     except Exception as error:  # whatever the protocol's own code raises is a finding
-        yield Finding.broken(
+        yield CheckFinding.broken(
             "the session with the simulated robot is established", error, "a simulated robot that listens"
         )
         return
@@ -68,6 +71,43 @@ def main(arguments: list[str]) -> int:
         sys.stdout.flush()
     sys.stdout.write(f"{protocol.name}: {held} hold, {failed} do not\n")
     return 1 if failed else 0
+
+
+def check_plugin(protocol: Protocol, name: str) -> Iterator[CheckFinding]:
+    """Check what the gateway needs before the first connection. name: the entry point's."""
+    checks: tuple[tuple[str, Callable[[], str | None]], ...] = (
+        ("the protocol has the name of its entry point", lambda: _named(protocol, name)),
+        ("the template is a configuration of this protocol", lambda: _template(protocol)),
+        ("a session can be shown", lambda: _shown(protocol)),
+    )
+    for claim, find in checks:
+        yield CheckFinding.tried(claim, find)
+
+
+def _named(protocol: Protocol, name: str) -> str | None:
+    return None if protocol.name == name else f"the entry point is {name!r}, Protocol.name is {protocol.name!r}"
+
+
+def _template(protocol: Protocol) -> str | None:
+    device = tomllib.loads(protocol.template).get("device")
+    if device is None:
+        return "it has no table [device]"
+    if device.get("protocol") != protocol.name:
+        return f"its protocol is {device.get('protocol')!r}, not {protocol.name!r}"
+    if not device.get("connect"):
+        return "it has no connect"
+    msgspec.convert(device.get("options", {}), protocol.options)
+    return None
+
+
+def _shown(protocol: Protocol) -> str | None:
+    robot = robot_of(protocol)
+    for link in robot.link_names:
+        session = robot.session(link, "tcp://robot.test:1")
+        if not isinstance(session.role, Role):
+            return f"role is {session.role!r}, not Role.HQ"
+        msgspec.convert(msgspec.to_builtins(session.snapshot()), SessionEntry)
+    return None
 
 
 if __name__ == "__main__":

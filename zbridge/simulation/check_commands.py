@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
@@ -14,8 +15,7 @@ from zbridge.fleet.messages import Drive, FleetMessage, Mode, Motor, Raw, Scan, 
 from zbridge.fleet.topics import Topic
 from zbridge.protocol.plugin import Protocol
 from zbridge.protocol.session import State
-from zbridge.simulation.check_report import Finding, raised
-from zbridge.simulation.check_stage import STEP_S, Recording, Rehearsal, robot_of
+from zbridge.simulation.check_stage import STEP_S, CheckFinding, Rehearsal, Transcript, raised, robot_of
 
 STOP_S = 0.5
 """Seconds for which the stop is repeated."""
@@ -27,30 +27,23 @@ MORE_FRAMES = 20
 """Frames of the robot after the handshake."""
 
 
-def check_stop(protocol: Protocol, recording: Recording) -> Iterator[Finding]:
+def check_stop(protocol: Protocol, recording: Transcript) -> Iterator[CheckFinding]:
     """Check that the stop is the next thing written, and that motion that waits is not sent after it."""
+    expected = "a stop that is put into the outbox"
     claim = "the stop goes before all that waits, and no motion after it"
-    try:
-        yield Finding.of(claim, _stop(protocol, recording))
-    except Exception as error:  # whatever the protocol's own code raises is a finding
-        yield Finding.broken(claim, error, "a stop that is put into the outbox")
+    yield CheckFinding.tried(claim, lambda: _stop(protocol, recording), expected)
     claim = "a stop is repeated until its time is over"
-    try:
-        yield Finding(claim, _repeated(protocol, recording))
-    except Exception as error:
-        yield Finding.broken(claim, error, "a stop that is put into the outbox")
+    yield CheckFinding.tried(claim, lambda: _repeated(protocol, recording), expected)
     claim = "a stop before the first connection is refused or ignored"
-    try:
+    yield CheckFinding.tried(claim, lambda: _early(protocol), "nothing, or Refused")
+
+
+def _early(protocol: Protocol) -> None:
+    with contextlib.suppress(Refused):
         robot_of(protocol).stop(0.0, 0.0)
-    except Refused:
-        pass
-    except Exception as error:
-        yield Finding.broken(claim, error, "nothing, or Refused")
-        return
-    yield Finding(claim)
 
 
-def _stop(protocol: Protocol, recording: Recording) -> list[str]:
+def _stop(protocol: Protocol, recording: Transcript) -> list[str]:
     standing, driven = _established(protocol, recording), _established(protocol, recording)
     idle = set(standing.run(WATCHED_S))
     standing.robot.stop(standing.now, standing.now)
@@ -65,7 +58,7 @@ def _stop(protocol: Protocol, recording: Recording) -> list[str]:
     return [problem for taken in (0, 1) for problem in _crowded(_crowd(protocol, recording, idle, taken), stop, motion)]
 
 
-def _crowd(protocol: Protocol, recording: Recording, idle: set[bytes], taken: int) -> Rehearsal:
+def _crowd(protocol: Protocol, recording: Transcript, idle: set[bytes], taken: int) -> Rehearsal:
     """Let commands, a request and polls wait. taken: how many are written then, as slots and the queue take turns."""
     queued = _established(protocol, recording)
     for topic, commands in _commands(protocol):
@@ -88,7 +81,7 @@ def _crowded(queued: Rehearsal, stop: set[bytes], motion: set[bytes]) -> list[st
     return problems + [f"{frame!r} moves the robot after its stop" for frame in later if frame in motion]
 
 
-def _repeated(protocol: Protocol, recording: Recording) -> str | None:
+def _repeated(protocol: Protocol, recording: Transcript) -> str | None:
     standing, stopped = _established(protocol, recording), _established(protocol, recording)
     idle = set(standing.run(WATCHED_S))
     standing.robot.stop(standing.now, standing.now)
@@ -99,23 +92,26 @@ def _repeated(protocol: Protocol, recording: Recording) -> str | None:
     return None if again or not stop else f"it is not written again in the second half of {STOP_S:g} s"
 
 
-def check_commands(protocol: Protocol, recording: Recording) -> Iterator[Finding]:
+def check_commands(protocol: Protocol, recording: Transcript) -> Iterator[CheckFinding]:
     """Check that every fleet command has an effect or is refused; a question likewise."""
     for topic, commands in _commands(protocol):
         claim = f"{topic.path} is carried out or refused with a code"
-        try:
-            rehearsal = _established(protocol, recording)
-            results = [_carry_out(rehearsal, topic, command) for command in commands]
-        except Exception as error:  # whatever the protocol's own code raises is a finding
-            yield Finding.broken(claim, error, "an Outcome, or Refused")
-            continue
-        silent = None if any(results) else "accepted, but nothing is written, shown, refused or left out"
-        yield Finding(claim, silent, next(filter(None, results), ""))
+        obey = partial(_obeyed, protocol, recording, topic, commands, claim)
+        yield CheckFinding.tried(claim, obey, "an Outcome, or Refused")
     yield _corners(protocol, recording)
     yield from (_question(protocol, recording, topic) for topic in (topics.MAP, topics.POSE))
 
 
-def _corners(protocol: Protocol, recording: Recording) -> Finding:
+def _obeyed(
+    protocol: Protocol, recording: Transcript, topic: Topic, commands: tuple[FleetMessage, ...], claim: str
+) -> CheckFinding:
+    rehearsal = _established(protocol, recording)
+    results = [_carry_out(rehearsal, topic, command) for command in commands]
+    silent = None if any(results) else "accepted, but nothing is written, shown, refused or left out"
+    return CheckFinding(claim, silent, next(filter(None, results), ""))
+
+
+def _corners(protocol: Protocol, recording: Transcript) -> CheckFinding:
     claim, problems = "drives at full scale are carried out or refused", []
     for forward, left, turn in itertools.product((-1.0, 0.0, 1.0), repeat=3):
         drive = Drive(forward=forward, left=left, turn=turn)
@@ -126,27 +122,27 @@ def _corners(protocol: Protocol, recording: Recording) -> Finding:
             rehearsal.run(STEP_S)
         except Exception as error:
             problems.append(f"{drive}: {raised(error, 'an Outcome, or Refused')}")
-    return Finding.of(claim, problems)
+    return CheckFinding.of(claim, problems)
 
 
 def _commands(protocol: Protocol) -> tuple[tuple[Topic, tuple[FleetMessage, ...]], ...]:
     return (*COMMANDS, (topics.CMD_RAW(protocol.name), (Raw(200, b"body"), Raw(1, b""))))
 
 
-def _question(protocol: Protocol, recording: Recording, topic: Topic) -> Finding:
+def _question(protocol: Protocol, recording: Transcript, topic: Topic) -> CheckFinding:
     claim = f"a question for {topic.path} is answered, asked or refused"
     try:
         rehearsal = _established(protocol, recording)
         idle = set(rehearsal.run(WATCHED_S))
         if rehearsal.robot.known(topic) is not None:
-            return Finding(claim, None, "answered")
+            return CheckFinding(claim, None, "answered")
         rehearsal.robot.ask(topic)
         asked = set(rehearsal.run(WATCHED_S)) - idle
-        return Finding(claim, None, "asked") if asked else Finding(claim, "nothing is written for it")
+        return CheckFinding(claim, None, "asked") if asked else CheckFinding(claim, "nothing is written for it")
     except Refused as refusal:
-        return Finding(claim, None, refusal.code)
+        return CheckFinding(claim, None, refusal.code)
     except Exception as error:
-        return Finding.broken(claim, error, "a question to the robot, or Refused")
+        return CheckFinding.broken(claim, error, "a question to the robot, or Refused")
 
 
 def _carry_out(rehearsal: Rehearsal, topic: Topic, command: FleetMessage) -> str:
@@ -173,10 +169,10 @@ def _give(rehearsal: Rehearsal, topic: Topic, command: FleetMessage) -> str:
     return "left out" if outcome.left_out else "shown" if outcome.telemetry else ""
 
 
-def _established(protocol: Protocol, recording: Recording) -> Rehearsal:
+def _established(protocol: Protocol, recording: Transcript) -> Rehearsal:
     rehearsal = Rehearsal(protocol, recording)
     frames = rehearsal.establish()
-    rehearsal.play(recording.heard[frames : frames + MORE_FRAMES])
+    rehearsal.play(recording.received[frames : frames + MORE_FRAMES])
     if rehearsal.session.state is not State.ESTABLISHED:
         raise RuntimeError(f"{rehearsal.session!r} after what established it before")
     return rehearsal

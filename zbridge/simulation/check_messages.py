@@ -13,7 +13,7 @@ import numpy as np
 from zbridge.errors import EncodeError, ProtocolError, describe
 from zbridge.protocol.codec import Codec
 from zbridge.protocol.plugin import Protocol
-from zbridge.simulation.check_report import Finding, raised
+from zbridge.simulation.check_stage import CheckFinding, raised
 from zbridge.wire import Whole
 from zbridge.wire.fields import CountedArray, Filling
 from zbridge.wire.frames import FrameBuffer, FramingFault
@@ -23,17 +23,19 @@ RANDOM_CASES = 500
 RANDOM_BYTES = 60
 
 
-def check_messages(protocol: Protocol) -> Iterator[Finding]:
+def check_messages(protocol: Protocol) -> Iterator[CheckFinding]:
     """Check every codec of a protocol."""
     if not protocol.codecs:
-        yield Finding("messages are declared", "Protocol.codecs is empty: nothing can be checked")
+        yield CheckFinding("messages are declared", "Protocol.codecs is empty: nothing can be checked")
     for codec in protocol.codecs:
         messages, problems = _examples(codec)
         frames = _frames(codec, messages, problems)
-        yield Finding.of(f"{codec.name}: {len(codec.messages)} messages round-trip", problems)
-        yield Finding.of(f"{codec.name}: whole, byte by byte and joined give the same", _cuts(codec, frames))
-        yield Finding.of(f"{codec.name}: what is cut off is a message or a ProtocolError", _truncated(codec, frames))
-        yield Finding.of(f"{codec.name}: random bytes are a message or a ProtocolError", _random(codec, frames))
+        yield CheckFinding.of(f"{codec.name}: {len(codec.messages)} messages round-trip", problems)
+        yield CheckFinding.of(f"{codec.name}: whole, byte by byte and joined give the same", _cuts(codec, frames))
+        yield CheckFinding.of(
+            f"{codec.name}: what is cut off is a message or a ProtocolError", _truncated(codec, frames)
+        )
+        yield CheckFinding.of(f"{codec.name}: random bytes are a message or a ProtocolError", _random(codec, frames))
 
 
 def example(declared: type) -> Any:

@@ -13,8 +13,7 @@ from zbridge.errors import Refused
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, Mode, Motion, Pose
 from zbridge.protocol.plugin import Protocol
-from zbridge.simulation.check_report import Finding
-from zbridge.simulation.check_stage import Live, live
+from zbridge.simulation.check_stage import CheckFinding, Stage, live
 
 DRIVE_S = 1.0
 AGAIN_S = 0.1
@@ -32,18 +31,18 @@ MOVING = 0.05
 """The speed, of full scale, at which a robot moves."""
 
 
-def check_motion(protocol: Protocol, establish_s: float) -> Iterator[Finding]:
+def check_motion(protocol: Protocol, establish_s: float) -> Iterator[CheckFinding]:
     """Drive the simulated robot forward, then stop it, and see what it shows or what is written."""
     try:
         yield from asyncio.run(_drive_and_stop(protocol, establish_s))
     except Exception as error:  # whatever the protocol's own code raises is a finding
-        yield Finding.broken("the simulated robot drives and stands", error)
+        yield CheckFinding.broken("the simulated robot drives and stands", error)
 
 
-async def _drive_and_stop(protocol: Protocol, establish_s: float) -> list[Finding]:
+async def _drive_and_stop(protocol: Protocol, establish_s: float) -> list[CheckFinding]:
     async with live(protocol) as scene:
         if not await scene.established(establish_s):
-            return [Finding("the simulated robot drives and stands", "a second session is not established")]
+            return [CheckFinding("the simulated robot drives and stands", "a second session is not established")]
         clock = asyncio.get_running_loop().time
         scene.robot.begun(1)
         with contextlib.suppress(Refused):  # where a mode is needed or known
@@ -65,18 +64,18 @@ async def _drive_and_stop(protocol: Protocol, establish_s: float) -> list[Findin
         ]
 
 
-async def _turn(scene: Live, clock: Callable[[], float], full_rad_s: float) -> Finding:
+async def _turn(scene: Stage, clock: Callable[[], float], full_rad_s: float) -> CheckFinding:
     """Turn to the left where the robot shows its heading; ``full_rad_s`` as in the options, 0 if unknown."""
     claim = "a turn of the simulated robot is counter-clockwise"
     before = _Seen(scene).poses
     if not before:
-        return Finding(claim, None, "not checked: it shows no pose")
+        return CheckFinding(claim, None, "not checked: it shows no pose")
     begun = clock()
     for _ in range(round(TURN_S / AGAIN_S)):
         try:
             scene.robot.command(topics.CMD_DRIVE, Drive(turn=TURN), clock())
         except Refused as refusal:
-            return Finding(claim, None, refusal.code)
+            return CheckFinding(claim, None, refusal.code)
         await _watch(scene, AGAIN_S)
     after = _Seen(scene).poses
     expected_rad = full_rad_s * TURN * (clock() - begun)
@@ -84,8 +83,8 @@ async def _turn(scene: Live, clock: Callable[[], float], full_rad_s: float) -> F
     await _watch(scene, STAND_S / 2)
     turned = math.remainder(after[-1].heading - before[-1].heading, 2 * math.pi) if after else 0.0
     if turned < TURNED_RAD:
-        return Finding(claim, f"its heading changed by {turned:.3f} rad")
-    return Finding(claim, _unlike(turned, expected_rad, "rad"))
+        return CheckFinding(claim, f"its heading changed by {turned:.3f} rad")
+    return CheckFinding(claim, _unlike(turned, expected_rad, "rad"))
 
 
 def _full(protocol: Protocol, option: str) -> float:
@@ -101,7 +100,7 @@ def _unlike(seen: float, expected: float, unit: str) -> str | None:
     return f"{seen:.3f} {unit}, but the options say {expected:.3f} {unit}"
 
 
-async def _watch(scene: Live, seconds: float, *, keep: bool = False) -> _Seen:
+async def _watch(scene: Stage, seconds: float, *, keep: bool = False) -> _Seen:
     """Let the robot live; give what it showed. ``keep``: what it showed before counts too."""
     if not keep:
         scene.shown.clear()
@@ -114,7 +113,7 @@ async def _watch(scene: Live, seconds: float, *, keep: bool = False) -> _Seen:
 class _Seen:
     """What a robot showed of its motion, and what was written."""
 
-    def __init__(self, scene: Live) -> None:
+    def __init__(self, scene: Stage) -> None:
         self.poses: list[Pose] = []
         self.speeds: list[float] = []
         self.written = {frame for direction, frame in scene.frames if direction == "out"}
@@ -128,28 +127,28 @@ class _Seen:
         first, last = self.poses[0], self.poses[-1]
         return (last.x - first.x) * math.cos(first.heading) + (last.y - first.y) * math.sin(first.heading)
 
-    def moves(self, idle: _Seen, expected_m: float) -> Finding:
-        """Tell whether it moved, or at least was told so."""
+    def moves(self, idle: _Seen, expected_m: float) -> CheckFinding:
+        """Tell whether it moved, or at least was commanded so."""
         claim = "the simulated robot drives"
         if not self.poses and not self.speeds:
-            told = bool(self.written - idle.written)
-            return Finding(claim, None if told else "nothing is written for a drive", "seen on the wire only")
+            commanded = bool(self.written - idle.written)
+            return CheckFinding(claim, None if commanded else "nothing is written for a drive", "seen on the wire only")
         if self.poses and self.way_m < MOVED_M:
-            return Finding(claim, f"it moved {self.way_m:.3f} m ahead in {DRIVE_S:g} s")
+            return CheckFinding(claim, f"it moved {self.way_m:.3f} m ahead in {DRIVE_S:g} s")
         if self.poses and (unlike := _unlike(self.way_m, expected_m, "m")):
-            return Finding(claim, unlike)
+            return CheckFinding(claim, unlike)
         if self.speeds and max(map(abs, self.speeds)) < MOVING:
-            return Finding(claim, f"it shows a speed of {max(map(abs, self.speeds)):g}")
-        return Finding(claim, None, f"{self.way_m:.2f} m" if self.poses else "by its speed")
+            return CheckFinding(claim, f"it shows a speed of {max(map(abs, self.speeds)):g}")
+        return CheckFinding(claim, None, f"{self.way_m:.2f} m" if self.poses else "by its speed")
 
-    def stands(self, stop: _Seen, drive: _Seen) -> Finding:
-        """Tell whether it stood after the stop, or at least was told so."""
+    def stands(self, stop: _Seen, drive: _Seen) -> CheckFinding:
+        """Tell whether it stood after the stop, or at least was commanded so."""
         claim = "the simulated robot stands after its stop"
         if not self.poses and not self.speeds:
-            told = bool(stop.written - drive.written)
-            return Finding(claim, None if told else "nothing is written for a stop", "seen on the wire only")
+            commanded = bool(stop.written - drive.written)
+            return CheckFinding(claim, None if commanded else "nothing is written for a stop", "seen on the wire only")
         if self.poses and abs(self.way_m) > MOVED_M:
-            return Finding(claim, f"it moves on: {self.way_m:.3f} m in {WATCHED_S:g} s")
+            return CheckFinding(claim, f"it moves on: {self.way_m:.3f} m in {WATCHED_S:g} s")
         if self.speeds and abs(self.speeds[-1]) > MOVING:
-            return Finding(claim, f"it shows a speed of {self.speeds[-1]:g}")
-        return Finding(claim)
+            return CheckFinding(claim, f"it shows a speed of {self.speeds[-1]:g}")
+        return CheckFinding(claim)

@@ -9,8 +9,7 @@ from zbridge.errors import ProtocolError
 from zbridge.fleet import payload as payloads
 from zbridge.protocol.plugin import Protocol
 from zbridge.protocol.session import State
-from zbridge.simulation.check_report import Finding, raised
-from zbridge.simulation.check_stage import Recording, Rehearsal, robot_of
+from zbridge.simulation.check_stage import CheckFinding, Rehearsal, Transcript, raised, robot_of
 
 STEPS = 12
 """Steps of a long handshake at which something goes wrong."""
@@ -20,29 +19,29 @@ STAMP_NS, STAMP_WITHIN_NS = 10**18, 10**10
 """When the robot's messages come, and how far a stamp may be from it: a robot may have a clock of its own."""
 
 
-def check_sessions(protocol: Protocol, recording: Recording) -> Iterator[Finding]:
+def check_sessions(protocol: Protocol, recording: Transcript) -> Iterator[CheckFinding]:
     """Check the session of the driving link."""
-    yield Finding("the session with the simulated robot is established", recording.reason)
+    yield CheckFinding("the session with the simulated robot is established", recording.reason)
     if not recording.established:
         return
-    yield Finding.of(
+    yield CheckFinding.of(
         f"{len(recording.messages)} messages of the robot are translated", _translated(protocol, recording)
     )
     count = recording.unanswered
     without = f"{count} had no answer in time: see expects, answers and frame_end" if count else None
-    yield Finding("the simulated robot answers every request", without)
+    yield CheckFinding("the simulated robot answers every request", without)
     try:
         steps = _steps(protocol, recording)
     except Exception as error:
-        yield Finding.broken("what the robot said establishes a session again", error, "the same session again")
+        yield CheckFinding.broken("what the robot said establishes a session again", error, "the same session again")
         return
     tried = f"each step of the handshake ({len(steps)})"
     for claim, go_wrong in (("garbage", _garbage), ("silence", _silence), ("the end of the connection", _lost)):
         problems = [problem for step in steps for problem in _at(step, protocol, recording, go_wrong)]
-        yield Finding.of(f"{claim} at {tried} ends or spares the session", problems)
+        yield CheckFinding.of(f"{claim} at {tried} ends or spares the session", problems)
 
 
-def _steps(protocol: Protocol, recording: Recording) -> list[int]:
+def _steps(protocol: Protocol, recording: Transcript) -> list[int]:
     """List after how many frames of the robot something goes wrong: 0, all of the handshake, and some between."""
     rehearsal = Rehearsal(protocol, recording)
     frames = rehearsal.establish()
@@ -54,15 +53,15 @@ def _steps(protocol: Protocol, recording: Recording) -> list[int]:
 def _at(
     step: int,
     protocol: Protocol,
-    recording: Recording,
+    recording: Transcript,
     go_wrong: Callable[[Rehearsal, list[bytes]], Iterator[str]],
 ) -> Iterator[str]:
     try:
         for seed in range(SEEDS):
             rehearsal = Rehearsal(protocol, recording)
-            rehearsal.play(recording.heard[:step])
+            rehearsal.play(recording.received[:step])
             noise = random.Random(seed).randbytes(GARBAGE_BYTES)
-            for problem in go_wrong(rehearsal, [noise, *recording.heard[step : step + 3]]):
+            for problem in go_wrong(rehearsal, [noise, *recording.received[step : step + 3]]):
                 yield f"after {step} frames: {problem}"
     except Exception as error:  # whatever the protocol's own code raises is a finding
         yield f"after {step} frames: {raised(error, 'a session that goes on, or Session.fail with a reason')}"
@@ -71,7 +70,7 @@ def _at(
 def _garbage(rehearsal: Rehearsal, frames: list[bytes]) -> Iterator[str]:
     rehearsal.play(frames)
     rehearsal.run(1.0)
-    yield from _told(rehearsal)
+    yield from _without_reason(rehearsal)
 
 
 def _silence(rehearsal: Rehearsal, frames: list[bytes]) -> Iterator[str]:
@@ -79,7 +78,7 @@ def _silence(rehearsal: Rehearsal, frames: list[bytes]) -> Iterator[str]:
     rehearsal.run(limit_s, answers=False)
     if rehearsal.session.state in (State.CONNECTING, State.HANDSHAKING):
         yield f"still {rehearsal.session.state.value} after {limit_s:g} s of silence"
-    yield from _told(rehearsal)
+    yield from _without_reason(rehearsal)
 
 
 def _lost(rehearsal: Rehearsal, frames: list[bytes]) -> Iterator[str]:
@@ -88,15 +87,15 @@ def _lost(rehearsal: Rehearsal, frames: list[bytes]) -> Iterator[str]:
     rehearsal.run(1.0)
     if session.state is not State.CLOSED or session.deadline() is not None or session.receive(frames[0], rehearsal.now):
         yield f"{session!r} still does something when its connection is gone"
-    yield from _told(rehearsal)
+    yield from _without_reason(rehearsal)
 
 
-def _told(rehearsal: Rehearsal) -> Iterator[str]:
+def _without_reason(rehearsal: Rehearsal) -> Iterator[str]:
     if rehearsal.session.over and not rehearsal.session.reason:
         yield "ended without a reason"
 
 
-def _translated(protocol: Protocol, recording: Recording) -> list[str]:
+def _translated(protocol: Protocol, recording: Transcript) -> list[str]:
     """Translate what the robot sent; telemetry has to be what its topic promises."""
     robot, problems = robot_of(protocol), []
     for name in robot.link_names:

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from typing import Any
 
 import msgspec
 
-from zbridge.errors import FAULT, ProtocolError
+from zbridge.errors import FAULT, ProtocolError, describe
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
@@ -23,8 +23,57 @@ from zbridge.protocol.plugin import Protocol, Robot, Simulation
 from zbridge.protocol.session import Session, State
 from zbridge.transport import Conversation, connect
 
+
+class CheckFinding(msgspec.Struct, frozen=True):
+    """One line of the report. ``problem`` None: the claim holds. ``note``: what a reader should know of it."""
+
+    claim: str
+    problem: str | None = None
+    note: str = ""
+
+    @classmethod
+    def of(cls, claim: str, problems: list[str], note: str = "") -> CheckFinding:
+        """Make the finding of a claim that was tried in many ways: the first problems are shown."""
+        if not problems:
+            return cls(claim, None, note)
+        more = f" (and {len(problems) - _SHOWN} more)" if len(problems) > _SHOWN else ""
+        return cls(claim, "; ".join(problems[:_SHOWN]) + more, note)
+
+    @classmethod
+    def broken(cls, claim: str, error: BaseException, expected: str = "") -> CheckFinding:
+        """Make the finding of a claim whose check ended with an exception; ``expected``: what should have come."""
+        return cls(claim, raised(error, expected))
+
+    @classmethod
+    def tried(
+        cls, claim: str, find: Callable[[], str | list[str] | CheckFinding | None], expected: str = ""
+    ) -> CheckFinding:
+        """Make the finding of a check that gives a problem, several, or none, or that ends with an exception."""
+        try:
+            found = find()
+        except Exception as error:  # whatever the protocol's own code raises is a finding
+            return cls.broken(claim, error, expected)
+        if isinstance(found, CheckFinding):
+            return found
+        return cls.of(claim, found) if isinstance(found, list) else cls(claim, found)
+
+    def __str__(self) -> str:
+        note = f" ({self.note})" if self.note else ""
+        return (
+            f"ok    {self.claim}{note}" if self.problem is None else f"FAIL  {self.claim}{note}\n      {self.problem}"
+        )
+
+
+def raised(error: BaseException, expected: str) -> str:
+    """Say what the protocol's own code raised, in which class and line, and what was expected instead."""
+    return f"{describe(error)}; expected {expected}" if expected else describe(error)
+
+
+_SHOWN = 3
+
+
 SHOWN_S = 1.0
-"""Seconds that a recording goes on after the session was established."""
+"""Seconds that a recording continues after the session was established."""
 HANG_UP_S = 0.2
 """Seconds that the simulated robot is given to see that its peer is gone."""
 STEP_S = 0.01
@@ -35,10 +84,10 @@ _MOST_FRAMES = 400
 _ANSWER_FRAMES = 8
 
 
-class Recording(msgspec.Struct):
+class Transcript(msgspec.Struct):
     """What was said on the driving link, and whether all links were established. ``answers``: what followed a frame."""
 
-    heard: list[bytes] = []
+    received: list[bytes] = []
     answers: dict[bytes, list[bytes]] = {}
     messages: list[Any] = []
     established: bool = False
@@ -51,7 +100,7 @@ def robot_of(protocol: Protocol) -> Robot:
     return protocol.robot(msgspec.convert(protocol.simulated, protocol.options), protocol.links, Metrics())
 
 
-class Live:
+class Stage:
     """A robot object with a conversation on each link of the simulated robot."""
 
     def __init__(self, protocol: Protocol) -> None:
@@ -117,12 +166,12 @@ class Live:
 
 
 @contextlib.asynccontextmanager
-async def live(protocol: Protocol) -> AsyncIterator[Live]:
+async def live(protocol: Protocol) -> AsyncIterator[Stage]:
     """Run the simulated robot on loopback and connect to it."""
     ready: asyncio.Future[tuple[Address, ...]] = asyncio.get_running_loop().create_future()
     addresses = tuple(Address("127.0.0.1", 0) for _ in range(protocol.links))
     simulated = asyncio.ensure_future(protocol.simulate(Simulation(addresses, ready=ready.set_result)))
-    scene = Live(protocol)
+    scene = Stage(protocol)
     try:
         parts: tuple[asyncio.Future[Any], ...] = (simulated, ready)
         await asyncio.wait(parts, timeout=5.0, return_when=asyncio.FIRST_COMPLETED)
@@ -139,13 +188,13 @@ async def live(protocol: Protocol) -> AsyncIterator[Live]:
         await asyncio.wait([simulated])
 
 
-async def record(protocol: Protocol, establish_s: float) -> Recording:
+async def record(protocol: Protocol, establish_s: float) -> Transcript:
     """Converse with the simulated robot until a while after all links are established; keep what was said."""
     async with live(protocol) as scene:
         established = await scene.established(establish_s)
         if established:
             await asyncio.sleep(SHOWN_S)
-        return Recording(
+        return Transcript(
             [frame for direction, frame in scene.frames if direction == "in"][:_MOST_FRAMES],
             _answers(scene.frames),
             list(scene.messages),
@@ -170,7 +219,7 @@ def _answers(frames: list[tuple[str, bytes]]) -> dict[bytes, list[bytes]]:
 class Rehearsal:
     """The first link of a new robot object, without a link. ``now``: its time, seconds."""
 
-    def __init__(self, protocol: Protocol, recording: Recording) -> None:
+    def __init__(self, protocol: Protocol, recording: Transcript) -> None:
         self.robot = robot_of(protocol)
         self.now = 0.0
         sessions = [self.robot.session(name, "tcp://robot.test:1") for name in self.robot.link_names]
@@ -187,13 +236,13 @@ class Rehearsal:
 
     def establish(self) -> int:
         """Let the robot say what it said, until the session is established; give how many frames that took."""
-        for count, frame in enumerate(self._recording.heard):
+        for count, frame in enumerate(self._recording.received):
             self.run(STEP_S)
             if self.session.state is not State.HANDSHAKING:
                 return count
             self._hear(frame)
         self.run(1.0)
-        return len(self._recording.heard)
+        return len(self._recording.received)
 
     def run(self, seconds: float, *, answers: bool = True) -> list[bytes]:
         """Let time pass and write what is due; give what was written. Raise RuntimeError where that never ends.

@@ -11,7 +11,7 @@ from mcap.writer import CompressionType, Writer
 from zbridge.fleet import topics
 from zbridge.fleet.messages import FleetMessage, Map, Pose, Scan, Status
 from zbridge.fleet.topics import Topic
-from zbridge.views.pictures import RobotPictures
+from zbridge.views.pictures import FoxglovePictures
 
 BEGIN_NS = 1_700_000_000_000_000_000
 POSE_NS = 50_000_000
@@ -20,7 +20,7 @@ POSE_NS = 50_000_000
 
 def record(path: Path, seconds: int, *, finish: bool = True) -> Path:
     """Write so many seconds of a robot that drives in a circle; not finished: as if the recorder was killed."""
-    pictures, numbers = RobotPictures("r1"), dict[str, int]()
+    pictures, numbers = FoxglovePictures("r1"), dict[str, int]()
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=8192, compression=CompressionType.ZSTD)
         writer.start()

@@ -4,7 +4,7 @@ import ipaddress
 
 import pytest
 
-from zbridge.views.foxglove.admission import Admission, Admitted, Policy, Request, Turned
+from zbridge.views.foxglove.admission import Admitted, Policy, Rejection, UpgradeRequest, ViewerAdmission
 
 TOKEN = "a" * 32
 FOXGLOVE, PAGE, EVIL = "https://app.foxglove.dev", "https://robots.example", "https://evil.example"
@@ -41,8 +41,8 @@ CASES = [
 def test_a_handshake_is_admitted_or_turned_away(
     policy: Policy, path: str, origins: tuple[str, ...], subprotocols: tuple[str, ...], expected: bool | str
 ) -> None:
-    decision = Admission(policy).admit(Request(path, origins, subprotocols), "10.0.0.7", 3)
-    if isinstance(decision, Turned):
+    decision = ViewerAdmission(policy).admit(UpgradeRequest(path, origins, subprotocols), "10.0.0.7", 3)
+    if isinstance(decision, Rejection):
         assert decision.reason == expected
         assert TOKEN not in decision.text
     else:
@@ -54,13 +54,13 @@ def test_a_handshake_is_admitted_or_turned_away(
     [("/", "10.0.0.7"), ("/?name=anna", "anna"), ("/?name=" + "x" * 99, "x" * 24), ("/?name=%00/*", "%00%2F%2A")],
 )
 def test_a_viewer_is_called_as_it_says_as_far_as_keys_can_hold_it(path: str, label: str) -> None:
-    decision = Admission(Policy()).admit(Request(path, (), SPOKEN), "10.0.0.7", 0)
+    decision = ViewerAdmission(Policy()).admit(UpgradeRequest(path, (), SPOKEN), "10.0.0.7", 0)
     assert isinstance(decision, Admitted)
     assert decision.label == label
 
 
 def test_connections_are_refused_by_network_by_rate_and_by_number_before_they_say_anything() -> None:
-    near = Admission(Policy(networks=(ipaddress.ip_network("10.0.0.0/8"),), viewers=4))
+    near = ViewerAdmission(Policy(networks=(ipaddress.ip_network("10.0.0.0/8"),), viewers=4))
     assert near.refusal("192.168.0.1", 0, 0.0) == "network"
     assert near.refusal("::ffff:10.1.2.3", 0, 0.0) is None
     assert near.refusal("10.1.2.4", 8, 0.0) == "full"

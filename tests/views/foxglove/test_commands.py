@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from zbridge.errors import BusError, Held, Malformed, NeutralFirst, Refused, TooFast, Unsupported
-from zbridge.views.foxglove.commands import Commands
+from zbridge.views.foxglove.commands import RobotCommands
 from zbridge.views.foxglove.hub import Hub
 from zbridge.views.foxglove.pilot import DEADMAN_S, PAUSE_S, Pilot
 from zbridge.views.foxglove.requests import ClientChannel
@@ -139,7 +139,7 @@ class Scene:
         self.hub, self.fleet, self.viewer = Hub(), PlayedFleet(), Viewer()
         self.hub.join(self.viewer)
         scales = Scales(Scale(2.0, 4.0))
-        self.commands = Commands(self.hub, self.fleet, scales, "foxglove")  # type: ignore[arg-type]
+        self.commands = RobotCommands(self.hub, self.fleet, scales, "foxglove")  # type: ignore[arg-type]
         for name in self.fleet.robots:
             self.commands.robot_came(name)
         self.r1 = self.fleet["r1"]

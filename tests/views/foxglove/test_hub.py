@@ -4,11 +4,12 @@ import json
 from typing import Any
 
 from zbridge.views.foxglove.hub import Hub
-from zbridge.views.pictures import Channel, Schema
+from zbridge.views.pictures import ViewerChannel
+from zbridge.views.schemas import Schema
 
 SCHEMA = Schema("x", "jsonschema", b"{}", "json")
-SCAN = Channel("/r1/scan", "scan", SCHEMA)
-MAP = Channel("/r1/map", "map", SCHEMA, keeps_last=True)
+SCAN = ViewerChannel("/r1/scan", "scan", SCHEMA)
+MAP = ViewerChannel("/r1/map", "map", SCHEMA, keeps_last=True)
 
 
 class Looking:
@@ -103,5 +104,5 @@ def test_a_channel_that_is_withdrawn_ends_its_subscriptions_and_comes_back_with_
 
 def test_channels_are_bounded() -> None:
     hub = Hub()
-    left_out = hub.offer(Channel(f"/r/{number}", "x", SCHEMA) for number in range(8200))
+    left_out = hub.offer(ViewerChannel(f"/r/{number}", "x", SCHEMA) for number in range(8200))
     assert left_out == 8

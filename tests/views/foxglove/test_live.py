@@ -13,9 +13,9 @@ from zbridge.fleet.messages import Control, Device, Devices, FleetMessage, Latch
 from zbridge.fleet.payload import encode
 from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
-from zbridge.views.foxglove.commands import Commands
+from zbridge.views.foxglove.commands import RobotCommands
 from zbridge.views.foxglove.hub import Hub
-from zbridge.views.foxglove.live import Live
+from zbridge.views.foxglove.live import LiveSource
 from zbridge.views.foxglove.twist import Scales
 
 GATEWAY = "fleet/r1/@alive/gateway"
@@ -29,8 +29,8 @@ class Scene:
         self.bus = self.robot.join("2")
         self.metrics = Metrics()
         self.hub = Hub()
-        commands = Commands(self.hub, Fleet(self.bus), Scales(), "foxglove")
-        self.live = Live(self.hub, self.bus, "fleet", frozenset(robots), commands, self.metrics)
+        commands = RobotCommands(self.hub, Fleet(self.bus), Scales(), "foxglove")
+        self.live = LiveSource(self.hub, self.bus, "fleet", frozenset(robots), commands, self.metrics)
         self.before = self.keys()
         self.live.start()
         self.viewer = Looking()
@@ -85,11 +85,16 @@ async def test_a_robot_is_there_while_its_gateway_is_and_leaves_nothing_behind()
     assert ids(scene.viewer) == {}
     token = scene.robot.announce(GATEWAY)
     assert {"/r1/scan", "/r1/pose", "/r1/map", "/r1/log"} <= set(ids(scene.viewer))
-    assert {service.name for service in scene.live.services()} >= {"/stop", "/r1/stop", "/r1/light", "/r1/mode"}
+    assert {service.name for service in scene.live.commands.services()} >= {
+        "/stop",
+        "/r1/stop",
+        "/r1/light",
+        "/r1/mode",
+    }
     scene.subscribe("/r1/pose")
     token.close()
     assert scene.keys() == []
-    assert {service.name for service in scene.live.services()} == {"/stop", "/latch", "/unlatch"}
+    assert {service.name for service in scene.live.commands.services()} == {"/stop", "/latch", "/unlatch"}
     assert scene.viewer.over
 
 

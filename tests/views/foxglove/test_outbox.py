@@ -1,10 +1,10 @@
 """What waits for a viewer: bounded, the newest wins, answers are never dropped."""
 
 from zbridge.views.foxglove import outbox as module
-from zbridge.views.foxglove.outbox import Outbox
+from zbridge.views.foxglove.outbox import ViewerOutbox
 
 
-def drained(outbox: Outbox) -> list[str | bytes]:
+def drained(outbox: ViewerOutbox) -> list[str | bytes]:
     messages = []
     while (message := outbox.next()) is not None:
         messages.append(message)
@@ -12,7 +12,7 @@ def drained(outbox: Outbox) -> list[str | bytes]:
 
 
 def test_messages_go_in_the_order_in_which_they_came_and_answers_first() -> None:
-    outbox = Outbox()
+    outbox = ViewerOutbox()
     outbox.show(1, b"a")
     outbox.show(2, b"b")
     outbox.say("answer")
@@ -22,7 +22,7 @@ def test_messages_go_in_the_order_in_which_they_came_and_answers_first() -> None
 
 
 def test_a_full_queue_loses_its_oldest_message_and_no_other_queue_does() -> None:
-    outbox = Outbox()
+    outbox = ViewerOutbox()
     outbox.show(2, b"other")
     for number in range(module.DEPTH + 5):
         outbox.show(1, b"%d" % number)
@@ -31,7 +31,7 @@ def test_a_full_queue_loses_its_oldest_message_and_no_other_queue_does() -> None
 
 
 def test_the_bytes_of_all_messages_together_are_bounded() -> None:
-    outbox, large = Outbox(), bytes(module.MOST_BYTES // 4)
+    outbox, large = ViewerOutbox(), bytes(module.MOST_BYTES // 4)
     for number in range(10):
         outbox.show(number, bytes([number]) + large)
     waiting = drained(outbox)
@@ -40,14 +40,14 @@ def test_the_bytes_of_all_messages_together_are_bounded() -> None:
 
 
 def test_a_message_that_is_too_large_by_itself_is_sent_alone() -> None:
-    outbox, large = Outbox(), bytes(module.MOST_BYTES + 1)
+    outbox, large = ViewerOutbox(), bytes(module.MOST_BYTES + 1)
     outbox.show(1, b"small")
     outbox.show(2, large)
     assert drained(outbox) == [large]
 
 
 def test_what_waits_of_an_ended_subscription_is_forgotten() -> None:
-    outbox = Outbox()
+    outbox = ViewerOutbox()
     for subscription in (1, 2, 1):
         outbox.show(subscription, b"%d" % subscription)
     outbox.forget(1)
@@ -56,7 +56,7 @@ def test_what_waits_of_an_ended_subscription_is_forgotten() -> None:
 
 
 def test_too_many_answers_or_too_long_ones_are_an_overrun() -> None:
-    many, long = Outbox(), Outbox()
+    many, long = ViewerOutbox(), ViewerOutbox()
     for _ in range(module.CONTROLS):
         many.say("x")
     assert not many.overrun

@@ -11,22 +11,23 @@ import pytest
 
 from zbridge.views.foxglove.hub import Hub
 from zbridge.views.foxglove.playback import LATE_S, RECENT_S, Playback
-from zbridge.views.foxglove.recording import Message
+from zbridge.views.foxglove.recording import PlayedMessage
 from zbridge.views.foxglove.requests import PlaybackRequest
-from zbridge.views.pictures import Channel, Schema
+from zbridge.views.pictures import ViewerChannel
+from zbridge.views.schemas import Schema
 
 pytestmark = pytest.mark.jumping
 
 BEGIN_NS, S_NS = 1_700_000_000_000_000_000, 1_000_000_000
 PLAYING, PAUSED, ENDED = 0, 1, 3
 CHANNELS = {
-    topic: Channel(topic, "", Schema(schema, "jsonschema", b"{}", "json"))
+    topic: ViewerChannel(topic, "", Schema(schema, "jsonschema", b"{}", "json"))
     for topic, schema in (("/r1/pose", "foxglove.PoseInFrame"), ("/r1/map", "foxglove.Grid"))
 }
 
 
-def message(topic: str, second: float) -> Message:
-    return Message(topic, BEGIN_NS + round(second * S_NS), f"{topic} {second:g}".encode())
+def message(topic: str, second: float) -> PlayedMessage:
+    return PlayedMessage(topic, BEGIN_NS + round(second * S_NS), f"{topic} {second:g}".encode())
 
 
 class Recording:
@@ -40,11 +41,11 @@ class Recording:
         self.entries = sorted([message("/r1/map", 0.5), *poses], key=lambda each: each.log_ns)
         self.reads = 0
 
-    def messages(self, from_ns: int) -> Iterator[Message]:
+    def messages(self, from_ns: int) -> Iterator[PlayedMessage]:
         self.reads += 1
         return iter([each for each in self.entries if each.log_ns >= from_ns])
 
-    def last_before(self, topics: set[str], at_ns: int, since_ns: int) -> list[Message]:
+    def last_before(self, topics: set[str], at_ns: int, since_ns: int) -> list[PlayedMessage]:
         found = {each.topic: each for each in self.entries if each.topic in topics and since_ns <= each.log_ns <= at_ns}
         return list(found.values())
 

@@ -11,16 +11,17 @@ from typing import Any
 import pytest
 
 from zbridge.errors import BusError, Unsupported
-from zbridge.views.foxglove.hub import Hub
+from zbridge.views.foxglove.hub import Hub, Subscriber
 from zbridge.views.foxglove.replies import Service
 from zbridge.views.foxglove.requests import ClientChannel, PlaybackRequest
-from zbridge.views.foxglove.source import Person, Source
-from zbridge.views.foxglove.viewer import CALLS, PUBLISHED, RATE_HZ, SEND_S, SUBSCRIPTIONS, TOLD_HZ, Overrun, Viewer
-from zbridge.views.pictures import Channel, Schema
+from zbridge.views.foxglove.source import ViewerSource
+from zbridge.views.foxglove.viewer import CALLS, PUBLISHED, RATE_HZ, SEND_S, SUBSCRIPTIONS, WARNINGS_HZ, Overrun, Viewer
+from zbridge.views.pictures import ViewerChannel
+from zbridge.views.schemas import Schema
 
 pytestmark = pytest.mark.jumping
 
-CHANNELS = [Channel(f"/r1/{name}", name, Schema("S", "jsonschema", b"{}", "json")) for name in ("pose", "scan")]
+CHANNELS = [ViewerChannel(f"/r1/{name}", name, Schema("S", "jsonschema", b"{}", "json")) for name in ("pose", "scan")]
 
 
 class Connection:
@@ -46,11 +47,12 @@ class Connection:
         self.sent.append(message)
 
 
-class PlayedSource(Source):
+class PlayedSource(ViewerSource):
     """Notes what it is asked for, and refuses what the test says."""
 
     def __init__(self, hub: Hub) -> None:
         super().__init__(hub)
+        self.commands = self  # type: ignore[assignment]
         self.done: list[tuple[Any, ...]] = []
         self.fails: Exception | None = None
         self.goes_on = asyncio.Event()
@@ -59,24 +61,24 @@ class PlayedSource(Source):
     def services(self) -> list[Service]:
         return [Service(1, "/stop", "zbridge/Stop", {}, {})]
 
-    def greet(self, viewer: Person) -> None:
+    def greet(self, viewer: Subscriber) -> None:
         viewer.say("hello")
 
-    def published(self, viewer: Person, channel: ClientChannel, payload: bytes) -> None:
+    def published(self, viewer: Subscriber, channel: ClientChannel, payload: bytes) -> None:
         self.done.append((channel.topic, payload))
         self._fail()
 
-    def unpublished(self, viewer: Person, channel: ClientChannel) -> None:
+    def unpublished(self, viewer: Subscriber, channel: ClientChannel) -> None:
         self.done.append(("unpublished", channel.topic))
 
-    def play(self, viewer: Person, request: PlaybackRequest) -> None:
+    def play(self, viewer: Subscriber, request: PlaybackRequest) -> None:
         self.done.append(("play", request.play))
         self._fail()
 
     def watch_parameters(self, watched: bool) -> None:
         self.done.append(("watch", watched))
 
-    async def call(self, viewer: Person, service_id: int, payload: bytes) -> bytes:
+    async def call(self, viewer: Subscriber, service_id: int, payload: bytes) -> bytes:
         await self.goes_on.wait()
         self.done.append((service_id, payload))
         self._fail()
@@ -85,11 +87,11 @@ class PlayedSource(Source):
     async def parameters(self, names: tuple[str, ...], *, ask: bool = True) -> Mapping[str, Any]:
         return dict.fromkeys(names, ask)
 
-    async def set_parameter(self, viewer: Person, name: str, value: Any) -> None:
+    async def set_parameter(self, viewer: Subscriber, name: str, value: Any) -> None:
         self.done.append((name, value))
         self._fail()
 
-    async def left(self, viewer: Person) -> None:
+    async def left(self, viewer: Subscriber) -> None:
         self.done.append(("left",))
         self._fail()
 
@@ -271,7 +273,7 @@ async def test_a_refusal_of_the_source_and_a_spoiled_message_are_counted_and_end
 
 async def test_warnings_are_few_and_counts_are_not(scene: Scene) -> None:
     told = await scene.warned(*["{"] * 100)
-    assert TOLD_HZ <= len(told) < 2 * TOLD_HZ
+    assert WARNINGS_HZ <= len(told) < 2 * WARNINGS_HZ
     assert scene.counts == {"said": 100, "malformed": 100}
     await asyncio.sleep(1.0)
     assert await scene.warned("{") != []

@@ -7,12 +7,13 @@ import pytest
 
 from zbridge.errors import ProtocolError
 from zbridge.views.foxglove import replies, requests
-from zbridge.views.foxglove.replies import Level, PlaybackStatus, Service
+from zbridge.views.foxglove.replies import PlaybackStatus, Service, StatusLevel
 from zbridge.views.foxglove.requests import PlaybackRequest, Published, ServiceCall
-from zbridge.views.pictures import Channel, Schema, foxglove_schema
+from zbridge.views.pictures import ViewerChannel
+from zbridge.views.schemas import Schema, foxglove_schema
 
-POSE = Channel("/r1/pose", "pose", foxglove_schema("PoseInFrame"))
-JSON = Channel("/r1/x", "x", Schema("x", "jsonschema", b'{"type":"object"}', "json"))
+POSE = ViewerChannel("/r1/pose", "pose", foxglove_schema("PoseInFrame"))
+JSON = ViewerChannel("/r1/x", "x", Schema("x", "jsonschema", b'{"type":"object"}', "json"))
 CALL = ServiceCall(1, 77, "json", b"{}")
 
 BINARY = [
@@ -36,7 +37,7 @@ TEXT = [
         '"metadata":{"a":"b"},"sessionId":"17","dataStartTime":{"sec":0,"nsec":1},"dataEndTime":{"sec":2,"nsec":0}}',
     ),
     (replies.unadvertise([2]), '{"op":"unadvertise","channelIds":[2]}'),
-    (replies.status(Level.ERROR, "Unknown"), '{"op":"status","level":2,"message":"Unknown"}'),
+    (replies.status(StatusLevel.ERROR, "Unknown"), '{"op":"status","level":2,"message":"Unknown"}'),
     (
         replies.service_failure(ServiceCall(99, 78, "json", b""), "Unknown service"),
         '{"op":"serviceCallFailure","serviceId":99,"callId":78,"message":"Unknown service"}',

@@ -9,29 +9,30 @@ import msgpack
 import pytest
 
 from tests.views.recording import files
-from zbridge.views.recording.player import Pace, Player
+from zbridge.views.recording.player import PlaybackClock, Player
 from zbridge.views.recording.selection import Selection
-from zbridge.views.recording.stamps import with_stamp
+from zbridge.views.stamps import with_stamp
 
 S_NS = files.S_NS
 
 
-@pytest.mark.parametrize(("speed", "expected"), [(1.0, 13.0), (2.0, 11.5), (0.5, 16.0)])
+@pytest.mark.parametrize(("speed", "expected"), [(1.0, 3.0), (2.0, 1.5), (0.5, 6.0)])
 def test_a_moment_is_due_as_the_speed_says(speed: float, expected: float) -> None:
-    pace = Pace(speed)
-    pace.begin(5 * S_NS, 10.0)
-    assert pace.due(8 * S_NS) == expected
+    clock = PlaybackClock(0, 2**64)
+    clock.play(speed, 9.0)
+    clock.seek(5 * S_NS, 10.0)
+    assert clock.wait_s(8 * S_NS, 10.0) == expected
 
 
 def test_a_pause_moves_what_follows_by_its_length() -> None:
-    pace = Pace()
-    pace.begin(0, 10.0)
-    pace.pause(11.0)
-    pace.pause(12.0)
-    assert pace.paused
-    pace.resume(14.0)
-    pace.resume(15.0)
-    assert (pace.due(2 * S_NS), pace.paused) == (15.0, False)
+    clock = PlaybackClock(0, 2**64)
+    clock.play(1.0, 10.0)
+    clock.pause(11.0)
+    clock.pause(12.0)
+    assert not clock.playing
+    clock.play(1.0, 14.0)
+    clock.play(1.0, 15.0)
+    assert (clock.wait_s(2 * S_NS, 15.0), clock.playing) == (0.0, True)
 
 
 class Clock:

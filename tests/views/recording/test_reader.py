@@ -13,14 +13,14 @@ import pytest
 import zstandard
 
 from tests.views.recording import files
-from zbridge.views.recording.reader import MAGIC, RECORD_BYTES, Reader
+from zbridge.views.recording.reader import MAGIC, RECORD_BYTES, RecordingReader
 
 SCANS = [("fleet/r1/scan", number / 10, bytes([number]) * 300) for number in range(100)]
 
 
 def test_what_the_library_wrote_is_read_with_times_and_topics(tmp_path: Path) -> None:
     with files.written(tmp_path / "a.mcap", SCANS).open("rb") as file:
-        reader = Reader(file)
+        reader = RecordingReader(file)
         read = [(each.channel.topic, each.log_ns, each.data) for each in reader.messages()]
     assert read == [(key, files.BEGAN_NS + int(seconds * 1e9), data) for key, seconds, data in SCANS]
     assert (reader.ended, reader.fault) == (True, None)
@@ -30,7 +30,7 @@ def test_a_file_cut_off_anywhere_gives_what_stands_before_the_cut(tmp_path: Path
     whole = files.written(tmp_path / "a.mcap", SCANS).read_bytes()
     counts = []
     for size in range(len(MAGIC), len(whole) - 400, 37):
-        reader = Reader(io.BytesIO(whole[:size]))
+        reader = RecordingReader(io.BytesIO(whole[:size]))
         read = [each.data for each in reader.messages()]
         assert read == [data for _, _, data in SCANS[: len(read)]]
         assert reader.ended or (reader.fault or "").startswith("cut off")
@@ -70,7 +70,7 @@ def test_a_lie_ends_the_file_and_says_what_is_wrong(name: str) -> None:
     lie, why = LIES[name]
     before = files.channel(3, "fleet/r1/pose") + files.message(3)
     data = lie if name == "no magic" else MAGIC + files.HEADER + before + lie + files.message(3)
-    reader = Reader(io.BytesIO(data))
+    reader = RecordingReader(io.BytesIO(data))
     read = list(reader.messages())
     assert len(read) == (name != "no magic")
     assert why in (reader.fault or "")
@@ -81,7 +81,7 @@ def test_a_bomb_takes_no_more_memory_than_its_chunk_may_have() -> None:
     bomb = files.chunk(b"", size=2**20, compression="zstd", of=zstandard.compress(bytes(2**28)))
     tracemalloc.start()
     try:
-        reader = Reader(files.stream(bomb))
+        reader = RecordingReader(files.stream(bomb))
         assert list(reader.messages()) == []
         assert tracemalloc.get_traced_memory()[1] < 16 * 2**20
     finally:
@@ -91,11 +91,11 @@ def test_a_bomb_takes_no_more_memory_than_its_chunk_may_have() -> None:
 
 def test_more_channels_than_are_kept_end_the_file_within_its_bounds() -> None:
     one = b"".join(files.channel(number, f"fleet/r1/sensor/{number}{'x' * 900}") for number in range(65_536))
-    reader = Reader(files.stream(one, files.channel(1, "other")))
+    reader = RecordingReader(files.stream(one, files.channel(1, "other")))
     assert list(reader.messages()) == []
     assert "and then" in (reader.fault or "") or "more than" in (reader.fault or "")
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    again = Reader(files.stream(*[files.channel(1, "k")] * 100_000, files.END))
+    again = RecordingReader(files.stream(*[files.channel(1, "k")] * 100_000, files.END))
     assert list(again.messages()) == []
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000  # kB: the file itself is in memory
 
@@ -107,7 +107,7 @@ def test_random_bytes_never_raise(tmp_path: Path) -> None:
         spoiled = bytearray(whole)
         for _ in range(rng.randrange(1, 6)):
             spoiled[rng.randrange(8, len(spoiled))] = rng.randrange(256)
-        reader = Reader(io.BytesIO(bytes(spoiled)))
+        reader = RecordingReader(io.BytesIO(bytes(spoiled)))
         assert len(list(reader.messages())) <= 20
     for _ in range(200):
-        list(Reader(io.BytesIO(MAGIC + rng.randbytes(rng.randrange(300)))).messages())
+        list(RecordingReader(io.BytesIO(MAGIC + rng.randbytes(rng.randrange(300)))).messages())

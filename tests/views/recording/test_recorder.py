@@ -21,14 +21,14 @@ from zbridge.bus.fake import FakeBus
 from zbridge.errors import ZbridgeError
 from zbridge.fleet import topics
 from zbridge.fleet.topics import KeySpace
-from zbridge.views.recording import files as written
 from zbridge.views.recording import recorder as recording
-from zbridge.views.recording.files import Tape, TapeSettings
+from zbridge.views.recording import tape as written
+from zbridge.views.recording.capture import BusCapture, RecordPlan
+from zbridge.views.recording.contents import Pictures
 from zbridge.views.recording.intake import Intake
-from zbridge.views.recording.pictures import Pictures
-from zbridge.views.recording.record import Recording, RecordPlan
 from zbridge.views.recording.recorder import Recorder
 from zbridge.views.recording.summary import summarize
+from zbridge.views.recording.tape import Tape, TapeSettings
 
 KEYS = KeySpace("fleet", "r1")
 LEASE, PROOF = bytes(range(8)), bytes(16)
@@ -45,7 +45,7 @@ class Scene:
         self.intake = Intake(bound)
         self.tape = Tape(TapeSettings(path, **options.pop("tape", {})))
         self.recorder = Recorder(self.tape, self.intake, {"zbridge": {"version": "9"}}, **options)
-        self._recording = Recording(self.bus.join("viewer"), plan or RecordPlan(), self.intake)
+        self._recording = BusCapture(self.bus.join("viewer"), plan or RecordPlan(), self.intake)
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[Scene]:

@@ -8,7 +8,7 @@ import pytest
 
 from tests.views.recording import files
 from zbridge.errors import ConfigError
-from zbridge.views.recording.configuration import describe_configuration
+from zbridge.views.recording.contents import describe_configuration
 from zbridge.views.recording.summary import summarize
 
 

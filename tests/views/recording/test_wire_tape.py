@@ -6,7 +6,7 @@ from pathlib import Path
 
 from tests.views.recording import files
 from zbridge.fleet.topics import KeySpace
-from zbridge.views.recording.reader import Reader
+from zbridge.views.recording.reader import RecordingReader
 from zbridge.views.recording.wire_tape import HANDSHAKE_S, steps, wire_links
 
 KEYS = KeySpace("fleet", "r1")
@@ -27,8 +27,8 @@ def test_a_frame_knows_when_it_went_and_what_the_gateway_had_said(tmp_path: Path
         (IN, late, b"c"),
     ]
     with files.written(tmp_path / "a.mcap", messages).open("rb") as file:
-        read = list(steps(Reader(file).messages(), KEYS, "robot"))
-    assert [(step.frame, round(step.at_s, 3), step.heard, step.datagram, step.answers) for step in read] == [
+        read = list(steps(RecordingReader(file).messages(), KEYS, "robot"))
+    assert [(step.frame, round(step.at_s, 3), step.received, step.datagram, step.answers) for step in read] == [
         (b"a", 0.0, 0, False, True),
         (b"b", 0.2, 3, True, True),
         (b"c", late, 3, False, False),
@@ -49,8 +49,8 @@ def test_a_conversation_ends_where_the_link_is_no_longer_offline(tmp_path: Path)
         (IN, 1.5, b"d"),
     ]
     with files.written(tmp_path / "a.mcap", messages).open("rb") as file:
-        read = list(steps(Reader(file).messages(), KEYS, "robot"))
-    assert [(step.number, step.frame, step.heard) for step in read] == [
+        read = list(steps(RecordingReader(file).messages(), KEYS, "robot"))
+    assert [(step.number, step.frame, step.received) for step in read] == [
         (1, b"a", 2),
         (1, b"b", 2),
         (1, b"c", 2),

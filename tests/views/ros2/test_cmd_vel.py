@@ -10,10 +10,10 @@ import pytest
 from zbridge.errors import Malformed, ProtocolError, Unsupported
 from zbridge.ros2 import types_of
 from zbridge.views.ros2.cmd_vel import STAMPED, TWIST, drive_of, read_twist
-from zbridge.views.ros2.settings import Body
+from zbridge.views.ros2.settings import RobotBody
 
-TURNS = Body(speed_full_mps=0.5, turn_full_radps=2.0)
-STEERS = Body(speed_full_mps=1.0, wheelbase_m=0.5, steer_full_rad=0.5)
+TURNS = RobotBody(speed_full_mps=0.5, turn_full_radps=2.0)
+STEERS = RobotBody(speed_full_mps=1.0, wheelbase_m=0.5, steer_full_rad=0.5)
 HEADER = b"\x00\x01\x00\x00"
 
 DRIVES = {  # m/s forward, m/s left, rad/s: forward, left, turn

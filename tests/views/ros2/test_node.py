@@ -19,7 +19,7 @@ from zbridge.metrics import Metrics
 from zbridge.ros2 import read_attachment, types_of
 from zbridge.views.ros2.node import RobotNode
 from zbridge.views.ros2.outlets import RosSide
-from zbridge.views.ros2.settings import Body
+from zbridge.views.ros2.settings import RobotBody
 
 COUNT = 300
 SCAN = encode(
@@ -45,7 +45,7 @@ class Scene:
     def __init__(self) -> None:
         self.fleet, self.ros, self.metrics = Told(), FakeBus(), Metrics()
         side = RosSide(self.ros, 0, types_of("jazzy"), self.metrics)
-        self.node = RobotNode(side, self.fleet, KeySpace("fleet", "r1"), Body(), drive=False)
+        self.node = RobotNode(side, self.fleet, KeySpace("fleet", "r1"), RobotBody(), drive=False)
 
     def listen(self, name: str, anybody: bool = True) -> None:
         """Let somebody listen to a topic, or nobody any more."""

@@ -27,21 +27,21 @@ from zbridge.fleet.messages import (
 )
 from zbridge.metrics import Metrics
 from zbridge.ros2 import DISTROS, types_of
-from zbridge.views.ros2.pictures import TOPICS, RobotPictures
-from zbridge.views.ros2.settings import Body, Mount
+from zbridge.views.ros2.pictures import TOPICS, RosPictures
+from zbridge.views.ros2.settings import Mount, RobotBody
 
 NOW_NS = 1_800_000_000_500_000_000
 STAMP_NS = NOW_NS - 20_000_000
 EVERYTHING = {topic.name for topic in TOPICS} | {"range/front_left", "joint_states"}
 TYPES = {topic.name: topic.type_name for topic in TOPICS}
-BODY = Body(speed_full_mps=2.0, laser=Mount(0.1, 0.0, 0.3, math.pi / 2))
+BODY = RobotBody(speed_full_mps=2.0, laser=Mount(0.1, 0.0, 0.3, math.pi / 2))
 BOTH = (np.array([1.0, 2.0], np.float32), np.array([1.0, 2.0], "<f4").tobytes())
 """The ranges of a scan as an array, and as the bytes of a payload."""
 STORES = {distro: get_typestore(Stores(f"ros2_{distro}")) for distro in DISTROS}
 
 
-def robot(distro: str = "jazzy", body: Body = BODY) -> RobotPictures:
-    return RobotPictures("r1", types_of(distro), body, Metrics())
+def robot(distro: str = "jazzy", body: RobotBody = BODY) -> RosPictures:
+    return RosPictures("r1", types_of(distro), body, Metrics())
 
 
 def cdr(made: Any, distro: str = "jazzy", name: str = "scan") -> Any:
@@ -51,7 +51,7 @@ def cdr(made: Any, distro: str = "jazzy", name: str = "scan") -> Any:
     return STORES[distro].deserialize_cdr(types_of(distro).encode(made), made.__msgtype__)
 
 
-def made(pictures: RobotPictures, message: Any, path: str = "", now_ns: int = NOW_NS) -> dict[str, Any]:
+def made(pictures: RosPictures, message: Any, path: str = "", now_ns: int = NOW_NS) -> dict[str, Any]:
     return {name: cdr(shape, name=name) for name, shape in pictures.make(path, message, now_ns, EVERYTHING)}
 
 
@@ -86,7 +86,7 @@ def test_a_scan_that_runs_clockwise_is_turned_round() -> None:
 
 @pytest.mark.parametrize("name", ["r", "r1", "r12", "r123", "a_robot_with_a_long_name"])
 def test_a_scan_is_the_bytes_that_rosbags_writes(name: str) -> None:
-    pictures = RobotPictures(name, types_of("jazzy"), BODY, Metrics())
+    pictures = RosPictures(name, types_of("jazzy"), BODY, Metrics())
     for number in range(2):  # the second one knows its period
         fields = {"stamp_ns": STAMP_NS + number * 100_000_000}
         ((_, written),) = pictures.make("scan", replace(scan([1.0, math.nan, 3.0]), **fields), NOW_NS, {"scan"})
@@ -121,7 +121,7 @@ WRONG = (
 @pytest.mark.parametrize("wrong", WRONG)
 def test_a_scan_without_sense_is_counted_and_left_out(wrong: Scan) -> None:
     metrics = Metrics()
-    pictures = RobotPictures("r1", types_of("jazzy"), BODY, metrics)
+    pictures = RosPictures("r1", types_of("jazzy"), BODY, metrics)
     assert list(pictures.make("scan", wrong, NOW_NS, EVERYTHING)) == []
     assert metrics.total("ros2_unusable") == 1
 
@@ -244,12 +244,12 @@ def test_fixed_frames_and_the_description_know_the_scanner() -> None:
     assert laser.rotation.z == pytest.approx(math.sqrt(0.5))
     assert '<link name="r1/base_link">' in fixed["robot_description"].data
     assert 'rpy="0 0 1.5708"' in fixed["robot_description"].data
-    alone = {name: cdr(shape) for name, shape in robot(body=Body(map_to_odom=False)).fixed(NOW_NS)}
+    alone = {name: cdr(shape) for name, shape in robot(body=RobotBody(map_to_odom=False)).fixed(NOW_NS)}
     assert [at.child_frame_id for at in alone["tf_static"].transforms] == ["r1/laser"]
 
 
 def test_sensors_and_the_camera_have_the_frames_of_their_messages_where_it_is_known_where_they_are() -> None:
-    body = Body(sensors={"front left": Mount(0.2, 0.1, 0.05, math.pi / 2), "camera": Mount(z=0.4)})
+    body = RobotBody(sensors={"front left": Mount(0.2, 0.1, 0.05, math.pi / 2), "camera": Mount(z=0.4)})
     pictures = robot(body=body)
     fixed = {name: cdr(shape) for name, shape in pictures.fixed(NOW_NS)}
     frames = {at.child_frame_id: (at.header.frame_id, at.transform) for at in fixed["tf_static"].transforms}
@@ -298,7 +298,7 @@ STAMPS = {
 @pytest.mark.parametrize(("given", "shown"), STAMPS.items())
 def test_stamps_from_the_far_future_become_now_and_are_counted(given: int, shown: int) -> None:
     metrics = Metrics()
-    pictures = RobotPictures("r1", types_of("jazzy"), BODY, metrics)
+    pictures = RosPictures("r1", types_of("jazzy"), BODY, metrics)
     (pose,) = (made for name, made in pictures.make("pose", Pose(0, 0, 0, stamp_ns=given), NOW_NS, {"pose"}))
     assert stamp(cdr(pose, name="pose").header) == shown
     assert metrics.total("ros2_stamps_clamped") == (given != shown)

@@ -15,7 +15,7 @@ from zbridge.ros2 import types_of
 from zbridge.views.ros2 import server
 from zbridge.views.ros2.outlets import RosSide
 from zbridge.views.ros2.server import HIDDEN_AFTER_S, View
-from zbridge.views.ros2.settings import File, Options, plan
+from zbridge.views.ros2.settings import Ros2Settings, plan
 
 pytestmark = pytest.mark.jumping
 
@@ -30,7 +30,7 @@ class Scene:
     def __init__(self, **options: Any) -> None:
         self.fleet, self.ros, self.metrics = FakeBus(), FakeBus(), Metrics()
         side = RosSide(self.ros, 0, types_of("jazzy"), self.metrics)
-        self.view = View(plan(Options(**options), File()), self.fleet.join("2"), side, None)
+        self.view = View(plan(Ros2Settings(**options)), self.fleet.join("2"), side, None)
         self.view.start()
 
     def nodes(self) -> dict[str, str]:
@@ -117,7 +117,7 @@ class Routed(FakeBus):
 
 
 def test_one_router_for_both_sides_is_refused() -> None:
-    planned = plan(Options(), File())
+    planned = plan(Ros2Settings())
     server._apart(Routed("1", "a"), Routed("2", "b"), planned)
     for fleet, ros in ((Routed("1", "a"), Routed("2", "b", "a")), (Routed("1"), Routed("2", "1"))):
         with pytest.raises(ConfigError, match=r"ros = tcp/localhost:7447: the same router as the fleet's"):

@@ -20,7 +20,7 @@ from zbridge.views.ros2.cmd_vel import TWIST
 from zbridge.views.ros2.diagnostics import OK, WARN
 from zbridge.views.ros2.driving import PUBLISHERS, Standing
 from zbridge.views.ros2.outlets import RosSide
-from zbridge.views.ros2.settings import Body
+from zbridge.views.ros2.settings import RobotBody
 from zbridge.views.ros2.teleop import ASK_S, RATE_HZ, SETTLE_S, STRANGERS_HZ, Teleop
 
 pytestmark = pytest.mark.jumping
@@ -36,7 +36,7 @@ class Scene:
         robot = Fleet(FakeBus(), "fleet", None)["r1"]
         node = self.side.node("/r1", "zbridge")
         self.fleet = FakeBus()
-        self.teleop = Teleop(self.side, node, robot, Body(), self.fleet, "fleet/r1/control", "ros2")
+        self.teleop = Teleop(self.side, node, robot, RobotBody(), self.fleet, "fleet/r1/control", "ros2")
         self.driving: Any = self.teleop._driving
 
     def counted(self, what: str) -> int:

@@ -41,7 +41,7 @@ class Policy(msgspec.Struct, frozen=True):
     who: str = "foxglove"
 
 
-class Request(msgspec.Struct, frozen=True):
+class UpgradeRequest(msgspec.Struct, frozen=True):
     """The opening handshake of a connection. origins, subprotocols: of all headers of that name."""
 
     path: str
@@ -49,7 +49,7 @@ class Request(msgspec.Struct, frozen=True):
     subprotocols: Sequence[str]
 
 
-class Turned(msgspec.Struct, frozen=True):
+class Rejection(msgspec.Struct, frozen=True):
     """A connection that is turned away. reason: one word, for counters; text: for people."""
 
     status: HTTPStatus
@@ -64,7 +64,7 @@ class Admitted(msgspec.Struct, frozen=True):
     may_drive: bool
 
 
-class Admission:
+class ViewerAdmission:
     """Admits connections as the policy says."""
 
     def __init__(self, policy: Policy) -> None:
@@ -72,29 +72,29 @@ class Admission:
         self._arrivals = Arrivals(ACCEPT_HZ)
 
     def __repr__(self) -> str:
-        return f"<Admission {self._arrivals!r}>"
+        return f"<ViewerAdmission {self._arrivals!r}>"
 
     def refusal(self, host: str, connections: int, now: float) -> str | None:
-        """Return why a connection is closed before it says anything, as one word; None if it may go on."""
+        """Return why a connection is closed before it sends anything, as one word; None if it may continue."""
         if self.policy.networks and not is_among(host, self.policy.networks):
             return "network"
         if not self._arrivals.admit(host, now):
             return "arrivals"
         return "full" if connections >= 2 * self.policy.viewers else None
 
-    def admit(self, request: Request, host: str, viewers: int) -> Admitted | Turned:
+    def admit(self, request: UpgradeRequest, host: str, viewers: int) -> Admitted | Rejection:
         """Decide about an opening handshake."""
         if any(origin not in self.policy.origins for origin in request.origins):
-            return Turned(HTTPStatus.FORBIDDEN, "origin", "this Origin is not allowed")
+            return Rejection(HTTPStatus.FORBIDDEN, "origin", "this Origin is not allowed")
         query = parse_qs(urlsplit(request.path).query, max_num_fields=16)
         if self.policy.token is not None:
             given = query.get("token", [""])[0]
             if not hmac.compare_digest(given.encode(), self.policy.token.encode()):
-                return Turned(HTTPStatus.UNAUTHORIZED, "token", "the token is missing or wrong")
+                return Rejection(HTTPStatus.UNAUTHORIZED, "token", "the token is missing or wrong")
         if viewers >= self.policy.viewers:
-            return Turned(HTTPStatus.SERVICE_UNAVAILABLE, "full", "as many viewers as there can be")
+            return Rejection(HTTPStatus.SERVICE_UNAVAILABLE, "full", "as many viewers as there can be")
         if SUBPROTOCOL not in request.subprotocols:
-            return Turned(HTTPStatus.BAD_REQUEST, "subprotocol", f"expected the subprotocol {SUBPROTOCOL}")
+            return Rejection(HTTPStatus.BAD_REQUEST, "subprotocol", f"expected the subprotocol {SUBPROTOCOL}")
         trusted = self.policy.token is not None or bool(request.origins)
         name = escape(query.get("name", [""])[0] or host)[:LABEL]
         return Admitted(name, self.policy.drive and trusted)

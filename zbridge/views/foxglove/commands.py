@@ -26,11 +26,11 @@ from zbridge.client.stops import Outcome
 from zbridge.errors import Held, Malformed, Unsupported, ZbridgeError
 from zbridge.fleet.topics import is_name
 from zbridge.views.foxglove import replies
-from zbridge.views.foxglove.hub import Hub
+from zbridge.views.foxglove.hub import Hub, Subscriber
 from zbridge.views.foxglove.pilot import Pilot
 from zbridge.views.foxglove.replies import Service
 from zbridge.views.foxglove.requests import ClientChannel
-from zbridge.views.foxglove.source import Person
+from zbridge.views.foxglove.source import ViewerCommands
 from zbridge.views.foxglove.twist import Scales, read_twist
 
 CMD_VEL, STOP, LATCH, UNLATCH = "cmd_vel", "stop", "latch", "unlatch"
@@ -43,7 +43,7 @@ _UNTOUCHED: Mapping[str, Any] = {"light": False, "lidar": False, "camera": False
 """A robot's parameters before anything is known of them."""
 
 
-class Commands:
+class RobotCommands(ViewerCommands):
     """Carries out what viewers tell the robots of a fleet. who: what drivers are called first."""
 
     def __init__(self, hub: Hub, fleet: Fleet, scales: Scales, who: str) -> None:
@@ -51,7 +51,7 @@ class Commands:
         self._fleet = fleet
         self._scales = scales
         self._who = who
-        self._pilots: dict[tuple[Person, str], Pilot] = {}
+        self._pilots: dict[tuple[Subscriber, str], Pilot] = {}
         self._robots: dict[str, dict[str, Any]] = {}
         """The parameters of each robot."""
         self._services: dict[int, tuple[str, str, Service]] = {}
@@ -64,7 +64,7 @@ class Commands:
             self._add("", what)
 
     def __repr__(self) -> str:
-        return f"<Commands of {len(self._robots)} robots, {len(self._pilots)} pilots>"
+        return f"<RobotCommands of {len(self._robots)} robots, {len(self._pilots)} pilots>"
 
     async def close(self) -> None:
         """Release all robots; stops that are on their way arrive."""
@@ -104,7 +104,7 @@ class Commands:
 
     # Topics
 
-    def published(self, viewer: Person, channel: ClientChannel, payload: bytes) -> None:
+    def published(self, viewer: Subscriber, channel: ClientChannel, payload: bytes) -> None:
         """Drive or stop a robot; raise Refused for any other channel."""
         robot, what = self._aim(channel)
         if what == STOP:
@@ -115,7 +115,7 @@ class Commands:
         self._may(viewer)
         self._pilot(viewer, robot).drive(read_twist(payload, self._scales.of(robot)))
 
-    def unpublished(self, viewer: Person, channel: ClientChannel) -> None:
+    def unpublished(self, viewer: Subscriber, channel: ClientChannel) -> None:
         """Release the robot that was driven on a channel."""
         robot, _, what = channel.topic.strip("/").partition("/")
         pilot = self._pilots.pop((viewer, robot), None) if what == CMD_VEL else None
@@ -134,7 +134,7 @@ class Commands:
         self._known(robot)
         return robot, what
 
-    def _pilot(self, viewer: Person, robot: str) -> Pilot:
+    def _pilot(self, viewer: Subscriber, robot: str) -> Pilot:
         pilot = self._pilots.get((viewer, robot))
         if pilot is None:
 
@@ -145,7 +145,7 @@ class Commands:
             self._pilots[viewer, robot] = pilot
         return pilot
 
-    def _stop_soon(self, viewer: Person, robot: str) -> None:
+    def _stop_soon(self, viewer: Subscriber, robot: str) -> None:
         """Stop a robot on a task. One runs for each robot; a stop that comes meanwhile makes it stop once more."""
         self._stopped([robot])
         if robot in self._stops:
@@ -153,7 +153,7 @@ class Commands:
         else:
             self._stops[robot] = asyncio.get_running_loop().create_task(self._stop_and_tell(viewer, robot))
 
-    async def _stop_and_tell(self, viewer: Person, robot: str) -> None:
+    async def _stop_and_tell(self, viewer: Subscriber, robot: str) -> None:
         try:
             await self._stop([robot])
             while robot in self._stop_again:
@@ -181,7 +181,7 @@ class Commands:
         """Return the services there are."""
         return [service for _, _, service in self._services.values()]
 
-    async def call(self, viewer: Person, service_id: int, payload: bytes) -> bytes:
+    async def call(self, viewer: Subscriber, service_id: int, payload: bytes) -> bytes:
         """Carry out a call; raise Refused or BusError."""
         if service_id not in self._services:
             raise Unsupported(f"there is no service {service_id}")
@@ -201,7 +201,7 @@ class Commands:
         known = {f"{robot}.{name}": value for robot, values in self._robots.items() for name, value in values.items()}
         return {name: known[name] for name in names if name in known} if names else known
 
-    async def set_parameter(self, viewer: Person, name: str, value: Any) -> None:
+    async def set_parameter(self, viewer: Subscriber, name: str, value: Any) -> None:
         """Send the command that a parameter stands for; raise Refused or BusError."""
         robot, _, what = name.rpartition(".")
         if what not in _UNTOUCHED:
@@ -210,7 +210,7 @@ class Commands:
         if what != STOP or value is True:
             await self._carry_out(viewer, robot, what, value)
 
-    async def _stop_or_release(self, viewer: Person, robot: str, what: str, reason: object) -> None:
+    async def _stop_or_release(self, viewer: Subscriber, robot: str, what: str, reason: object) -> None:
         """Stop, latch or unlatch one robot, or all."""
         if what == STOP:
             await self._stop([robot] if robot else sorted(self._robots))
@@ -226,7 +226,7 @@ class Commands:
             else:
                 _raise_first(await self._fleet.unlatch())
 
-    async def _carry_out(self, viewer: Person, robot: str, what: str, value: Any) -> None:
+    async def _carry_out(self, viewer: Subscriber, robot: str, what: str, value: Any) -> None:
         if what == STOP:
             await self._stop([robot])
             return
@@ -242,13 +242,13 @@ class Commands:
             await switch(value is True)
         self.noted(robot, what, value)  # what the robot then tells of it wins
 
-    async def _set_mode(self, viewer: Person, robot: str, mode: str) -> None:
+    async def _set_mode(self, viewer: Subscriber, robot: str, mode: str) -> None:
         for (other, held), pilot in self._pilots.items():
             if held == robot and other is not viewer and pilot.at_work:
                 raise Held(f"{robot} is driven by {other.name}", holder=other.name)
         await self._pilot(viewer, robot).set_mode(mode)
 
-    async def left(self, viewer: Person) -> None:
+    async def left(self, viewer: Subscriber) -> None:
         """Release all robots of a viewer that is gone."""
         gone = [key for key in self._pilots if key[0] is viewer]
         await asyncio.gather(*(self._pilots.pop(key).end() for key in gone))
@@ -257,7 +257,7 @@ class Commands:
         if robot not in self._robots:
             raise Unsupported(f"there is no robot {robot!r:.40}")
 
-    def _may(self, viewer: Person) -> None:
+    def _may(self, viewer: Subscriber) -> None:
         if not viewer.may_drive:
             raise Unsupported("you may look and stop, not drive: that needs --drive, and a token or a listed Origin")
 

@@ -1,7 +1,7 @@
 """The channels that viewers are offered, and who subscribed to which. Sans-IO.
 
-Work on demand: the source is told when the first viewer subscribes to a channel and when the last one leaves it, and
-publishes what is wanted only. The last message of a channel that keeps it is shown to whoever subscribes later.
+Work on demand: the source is notified when the first viewer subscribes to a channel and when the last one leaves it,
+and publishes what is wanted only. The last message of a channel that keeps it is shown to whoever subscribes later.
 """
 
 from __future__ import annotations
@@ -12,15 +12,21 @@ from typing import Any, Protocol
 import msgspec
 
 from zbridge.views.foxglove import replies
-from zbridge.views.foxglove.replies import Level
-from zbridge.views.pictures import Channel
+from zbridge.views.foxglove.replies import StatusLevel
+from zbridge.views.pictures import ViewerChannel
 
 CHANNELS = 8192
 """Most channels at a time."""
 
 
-class Receiver(Protocol):
-    """A viewer, as the hub needs it."""
+class Subscriber(Protocol):
+    """A viewer, as hub and sources need it.
+
+    name: shown to others as the driver. may_drive: whether its commands may move robots and change them.
+    """
+
+    name: str
+    may_drive: bool
 
     def say(self, message: str | bytes) -> None:
         """Send an answer or news."""
@@ -31,16 +37,19 @@ class Receiver(Protocol):
     def ended(self, subscription: int) -> None:
         """Forget a subscription: its channel is withdrawn."""
 
+    def warn(self, text: str) -> None:
+        """Tell the person something."""
+
     def parameters_changed(self, values: Mapping[str, Any]) -> None:
-        """Tell parameters, where the viewer watches them."""
+        """Send parameters, where the viewer watches them."""
 
 
 class _Offer:
-    def __init__(self, channel_id: int, channel: Channel) -> None:
+    def __init__(self, channel_id: int, channel: ViewerChannel) -> None:
         self.id = channel_id
         self.channel = channel
         self.entry: msgspec.Raw = replies.channel_entry(channel_id, channel)
-        self.wanted_by: dict[Receiver, int] = {}
+        self.wanted_by: dict[Subscriber, int] = {}
         self.last: tuple[int, bytes] | None = None
 
 
@@ -52,12 +61,14 @@ class Hub:
     """
 
     def __init__(self) -> None:
-        self.on_wanted: Callable[[Channel, bool], None] = lambda channel, wanted: None
-        self.on_subscribed: Callable[[Channel, Receiver, int], None] = lambda channel, viewer, subscription: None
-        self.viewers: set[Receiver] = set()
+        self.on_wanted: Callable[[ViewerChannel, bool], None] = lambda channel, wanted: None
+        self.on_subscribed: Callable[[ViewerChannel, Subscriber, int], None] = lambda channel, viewer, subscription: (
+            None
+        )
+        self.viewers: set[Subscriber] = set()
         self._offers: dict[int, _Offer] = {}
         self._by_topic: dict[str, _Offer] = {}
-        self._news: dict[str, str] = {}
+        self._warnings: dict[str, str] = {}
         self._next_id = 1
 
     def __repr__(self) -> str:
@@ -65,7 +76,7 @@ class Hub:
 
     # The source's side
 
-    def offer(self, channels: Iterable[Channel]) -> int:
+    def offer(self, channels: Iterable[ViewerChannel]) -> int:
         """Offer channels to all viewers; those that are offered already are left. Return how many had no place."""
         new, left_out = [], 0
         for channel in channels:
@@ -79,7 +90,7 @@ class Hub:
             self._offers[offer.id] = self._by_topic[channel.topic] = offer
             new.append(offer.entry)
         if new:
-            self._tell(replies.advertise(new))
+            self.say(replies.advertise(new))
         return left_out
 
     def withdraw(self, topics: Iterable[str]) -> None:
@@ -92,7 +103,7 @@ class Hub:
             if offer.wanted_by:
                 self.on_wanted(offer.channel, False)
         if gone:
-            self._tell(replies.unadvertise([offer.id for offer in gone]))
+            self.say(replies.unadvertise([offer.id for offer in gone]))
 
     def publish(self, topic: str, stamp_ns: int, payload: bytes) -> None:
         """Show a message to the viewers of a channel."""
@@ -106,45 +117,46 @@ class Hub:
 
     def say(self, message: str | bytes) -> None:
         """Tell all viewers."""
-        self._tell(message)
+        for viewer in self.viewers:
+            viewer.say(message)
 
     def warn(self, name: str, text: str | None) -> None:
         """Show all viewers, those who come later too, what holds until it is called anew with the same name."""
-        if self._news.get(name) == text:
+        if self._warnings.get(name) == text:
             return
         if text is None:
-            del self._news[name]
-            self._tell(replies.remove_status([name]))
+            del self._warnings[name]
+            self.say(replies.remove_status([name]))
         else:
-            self._news[name] = text
-            self._tell(replies.status(Level.WARNING, text, name))
+            self._warnings[name] = text
+            self.say(replies.status(StatusLevel.WARNING, text, name))
 
     def parameters_changed(self, values: Mapping[str, Any]) -> None:
         """Tell the viewers that watch these parameters."""
         for viewer in self.viewers:
             viewer.parameters_changed(values)
 
-    def wanted(self) -> list[Channel]:
+    def wanted(self) -> list[ViewerChannel]:
         """Return the channels that viewers subscribed to."""
         return [offer.channel for offer in self._offers.values() if offer.wanted_by]
 
     # The viewers' side
 
-    def join(self, viewer: Receiver) -> None:
+    def join(self, viewer: Subscriber) -> None:
         """Show a viewer the channels there are, and the warnings that hold."""
         self.viewers.add(viewer)
         if self._offers:
             viewer.say(replies.advertise(offer.entry for offer in self._offers.values()))
-        for name, text in self._news.items():
-            viewer.say(replies.status(Level.WARNING, text, name))
+        for name, text in self._warnings.items():
+            viewer.say(replies.status(StatusLevel.WARNING, text, name))
 
-    def leave(self, viewer: Receiver) -> None:
+    def leave(self, viewer: Subscriber) -> None:
         """End a viewer's subscriptions; idempotent."""
         self.viewers.discard(viewer)
         for offer in list(self._offers.values()):
             self._leave(viewer, offer)
 
-    def subscribe(self, viewer: Receiver, subscription: int, channel_id: int) -> bool:
+    def subscribe(self, viewer: Subscriber, subscription: int, channel_id: int) -> bool:
         """Subscribe a viewer to a channel it is not subscribed to; False for an unknown channel."""
         offer = self._offers.get(channel_id)
         if offer is None:
@@ -159,17 +171,13 @@ class Hub:
             self.on_subscribed(offer.channel, viewer, subscription)
         return True
 
-    def unsubscribe(self, viewer: Receiver, channel_id: int) -> None:
+    def unsubscribe(self, viewer: Subscriber, channel_id: int) -> None:
         """End one subscription of a viewer."""
         offer = self._offers.get(channel_id)
         if offer is not None:
             self._leave(viewer, offer)
 
-    def _leave(self, viewer: Receiver, offer: _Offer) -> None:
+    def _leave(self, viewer: Subscriber, offer: _Offer) -> None:
         if offer.wanted_by.pop(viewer, None) is not None and not offer.wanted_by:
             offer.last = None  # nothing renews it any more
             self.on_wanted(offer.channel, False)
-
-    def _tell(self, message: str | bytes) -> None:
-        for viewer in self.viewers:
-            viewer.say(message)

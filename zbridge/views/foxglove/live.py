@@ -8,27 +8,24 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import msgspec
 
 from zbridge.bus import Bus, Handle, Sample
-from zbridge.errors import BusError, PayloadError
-from zbridge.fleet import payload as payloads
+from zbridge.errors import BusError
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, Devices, FleetMessage, Reading, Switch
-from zbridge.fleet.topics import KeySpace, Topic, is_name, split_key, unescape
+from zbridge.fleet.topics import KeySpace, Topic, split_key, unescape
 from zbridge.metrics import Metrics
-from zbridge.views.foxglove.commands import Commands
+from zbridge.views.foxglove.commands import RobotCommands
 from zbridge.views.foxglove.hub import Hub
-from zbridge.views.foxglove.replies import Service
-from zbridge.views.foxglove.requests import ClientChannel
-from zbridge.views.foxglove.source import Person, Source
-from zbridge.views.pictures import Channel, RobotPictures, Schema, channels_of, json_schema, sources_of
+from zbridge.views.foxglove.source import ViewerSource
+from zbridge.views.live_robots import ROBOTS, OnDemandSubscriptions, read_payload, watch_robots
+from zbridge.views.pictures import FoxglovePictures, ViewerChannel, channels_of, sources_of
+from zbridge.views.schemas import Schema, json_schema
 
-ROBOTS = 256
-"""Most robots that are shown at a time."""
 SENSORS = 1024
 """Most sensors of one robot that have a channel."""
 _SENSORS = "sensors"
@@ -57,24 +54,23 @@ _encode = msgspec.json.Encoder().encode
 class _Shown:
     """One robot that is shown: its pictures, and what is subscribed to on the bus for it."""
 
-    def __init__(self, keys: KeySpace) -> None:
+    def __init__(self, keys: KeySpace, subscribe: Callable[[_Shown, str], Handle]) -> None:
         self.keys = keys
-        self.pictures = RobotPictures(keys.robot)
-        self.offered: dict[str, Channel] = {}
+        self.pictures = FoxglovePictures(keys.robot)
+        self.offered: dict[str, ViewerChannel] = {}
         self.wanted: set[str] = set()
         """Paths of the channels that somebody subscribed to."""
-        self.handles: dict[str, Handle] = {}
-        """By path or expression on the bus."""
+        self.subscribed = OnDemandSubscriptions(lambda source: subscribe(self, source))
         self.sensors = 0
 
 
-class Live(Source):
+class LiveSource(ViewerSource):
     """Shows the robots of a realm. robots: names of those that are shown, empty for all."""
 
     def __init__(
-        self, hub: Hub, bus: Bus, realm: str, robots: frozenset[str], commands: Commands, metrics: Metrics
+        self, hub: Hub, bus: Bus, realm: str, robots: frozenset[str], commands: RobotCommands, metrics: Metrics
     ) -> None:
-        super().__init__(hub)
+        super().__init__(hub, commands)
         self.capabilities = ("clientPublish", "services", "parameters", "parametersSubscribe")
         self._bus = bus
         self._realm = realm
@@ -89,12 +85,12 @@ class Live(Source):
         hub.on_wanted = self._on_wanted
 
     def __repr__(self) -> str:
-        return f"<Live {self._realm}, {len(self._shown)} robots>"
+        return f"<LiveSource {self._realm}, {len(self._shown)} robots>"
 
     def start(self) -> None:
         """Begin to watch for robots."""
         self._handles = [
-            self._bus.watch_alive(f"{self._realm}/*/@alive/gateway", self._on_gateway),
+            watch_robots(self._bus, self._realm, self._robots, self._on_gateway),
             self._bus.subscribe(f"{self._realm}/*/{topics.DEVICES.path}", self._on_devices, history=True),
             self._bus.subscribe(f"{self._realm}/*/{topics.CONTROL.path}", self._on_control, history=True),
         ]
@@ -110,10 +106,7 @@ class Live(Source):
 
     # Robots come and go
 
-    def _on_gateway(self, key: str, alive: bool) -> None:
-        split = split_key(key)
-        if split is None or not is_name(name := split[1]) or (self._robots and name not in self._robots):
-            return
+    def _on_gateway(self, name: str, alive: bool) -> None:
         if alive and name not in self._shown:
             if len(self._shown) >= ROBOTS:
                 self._left_out.value += 1
@@ -123,9 +116,9 @@ class Live(Source):
             self._hide(name)
 
     def _show(self, name: str) -> None:
-        self._shown[name] = shown = _Shown(KeySpace(self._realm, name))
+        self._shown[name] = shown = _Shown(KeySpace(self._realm, name), self._subscribe)
         channels = {channel.path: channel for path in _OFFERED for channel in channels_of(name, path)}
-        channels[_SENSORS] = Channel(f"/{name}/{_SENSORS}", _SENSORS, _sensors_schema())
+        channels[_SENSORS] = ViewerChannel(f"/{name}/{_SENSORS}", _SENSORS, _sensors_schema())
         self._offer(shown, channels.values())
         self._commands.robot_came(name)
 
@@ -135,8 +128,7 @@ class Live(Source):
         self.hub.warn(_latched(name), None)
         self.hub.withdraw([channel.topic for channel in shown.offered.values()])
         del self._shown[name]
-        for handle in shown.handles.values():
-            handle.close()
+        shown.subscribed.need(set())
 
     def _offer(self, shown: _Shown, channels: Any) -> None:
         new = [channel for channel in channels if channel.path not in shown.offered]
@@ -148,12 +140,8 @@ class Live(Source):
         split = split_key(sample.key)
         if split is None or (shown := self._shown.get(split[1])) is None:
             return
-        try:
-            devices = payloads.decode(Devices, sample.payload)
-        except PayloadError:
-            self._malformed.value += 1
-            return
-        for device in devices.devices:
+        devices = read_payload(Devices, sample.payload, self._malformed)
+        for device in devices.devices if devices is not None else ():
             self._found(shown, topics.SENSOR(device.name).path)
 
     def _on_control(self, sample: Sample) -> None:
@@ -161,13 +149,10 @@ class Live(Source):
         split = split_key(sample.key)
         if split is None or split[1] not in self._shown:
             return
-        try:
-            control = payloads.decode(Control, sample.payload)
-        except PayloadError:
-            self._malformed.value += 1
-            return
-        said = "; ".join(latch.described for latch in control.latches)
-        self.hub.warn(_latched(split[1]), f"{split[1]}: {said}" if said else None)
+        control = read_payload(Control, sample.payload, self._malformed)
+        if control is not None:
+            text = "; ".join(latch.described for latch in control.latches)
+            self.hub.warn(_latched(split[1]), f"{split[1]}: {text}" if text else None)
 
     def _found(self, shown: _Shown, path: str) -> None:
         if path not in shown.offered and shown.sensors < SENSORS:
@@ -176,7 +161,7 @@ class Live(Source):
 
     # Work on demand
 
-    def _on_wanted(self, channel: Channel, wanted: bool) -> None:
+    def _on_wanted(self, channel: ViewerChannel, wanted: bool) -> None:
         shown = self._shown.get(channel.topic.split("/")[1])
         if shown is None:
             return
@@ -184,27 +169,23 @@ class Live(Source):
         needed = {source for path in shown.wanted for source in self._sources(shown.offered[path])}
         if _ALL_SENSORS in needed:
             needed = {source for source in needed if source == _ALL_SENSORS or not source.startswith("sensor/")}
-        for source in shown.handles.keys() - needed:
-            shown.handles.pop(source).close()
-        for source in needed - shown.handles.keys():
-            topic = topics.find(source)
-            kept = topic is not None and topic.qos.keeps_last
-            shown.handles[source] = self._bus.subscribe(
-                shown.keys.key(source), lambda sample: self._take(shown, sample), history=kept
-            )
+        shown.subscribed.need(needed)
 
-    def _sources(self, channel: Channel) -> tuple[str, ...]:
+    def _subscribe(self, shown: _Shown, source: str) -> Handle:
+        topic = topics.find(source)
+        history = topic is not None and topic.qos.keeps_last
+        return self._bus.subscribe(shown.keys.key(source), lambda sample: self._receive(shown, sample), history=history)
+
+    def _sources(self, channel: ViewerChannel) -> tuple[str, ...]:
         return (_ALL_SENSORS,) if channel.path == _SENSORS else sources_of(channel)
 
-    def _take(self, shown: _Shown, sample: Sample) -> None:
+    def _receive(self, shown: _Shown, sample: Sample) -> None:
         path = shown.keys.path(sample.key)
         topic = topics.find(path)
         if topic is None:
             return
-        try:
-            message: FleetMessage = payloads.decode(topic.message, sample.payload)
-        except PayloadError:
-            self._malformed.value += 1
+        message: FleetMessage | None = read_payload(topic.message, sample.payload, self._malformed)
+        if message is None:
             return
         now_ns = time.time_ns()
         if isinstance(message, Reading) and _SENSORS in shown.wanted:
@@ -214,23 +195,7 @@ class Live(Source):
         for picture in shown.pictures.draw(topic, message, now_ns, shown.wanted):
             self.hub.publish(picture.channel.topic, now_ns, picture.payload)
 
-    # Commands
-
-    def services(self) -> list[Service]:
-        """Return the services of all robots."""
-        return self._commands.services()
-
-    def published(self, viewer: Person, channel: ClientChannel, payload: bytes) -> None:
-        """Drive or stop a robot."""
-        self._commands.published(viewer, channel, payload)
-
-    def unpublished(self, viewer: Person, channel: ClientChannel) -> None:
-        """Release the robot that was driven on a channel."""
-        self._commands.unpublished(viewer, channel)
-
-    async def call(self, viewer: Person, service_id: int, payload: bytes) -> bytes:
-        """Carry out a service's call."""
-        return await self._commands.call(viewer, service_id, payload)
+    # Parameters
 
     async def parameters(self, names: tuple[str, ...], *, ask: bool = True) -> Mapping[str, Any]:
         """Return the values of parameters, the robots' own where they tell them."""
@@ -257,22 +222,8 @@ class Live(Source):
 
     def _on_switch(self, sample: Sample) -> None:
         split = split_key(sample.key)
-        if split is None:
-            return
-        try:
-            switch = payloads.decode(Switch, sample.payload)
-        except PayloadError:
-            self._malformed.value += 1
-            return
-        self._commands.noted(split[1], split[2], switch.on)
-
-    async def set_parameter(self, viewer: Person, name: str, value: Any) -> None:
-        """Change a parameter: send the robot a command."""
-        await self._commands.set_parameter(viewer, name, value)
-
-    async def left(self, viewer: Person) -> None:
-        """Release what a viewer drove."""
-        await self._commands.left(viewer)
+        if split is not None and (switch := read_payload(Switch, sample.payload, self._malformed)) is not None:
+            self._commands.noted(split[1], split[2], switch.on)
 
 
 def _latched(robot: str) -> str:

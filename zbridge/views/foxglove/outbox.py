@@ -19,7 +19,7 @@ CONTROL_BYTES = 16 * 1024 * 1024
 """Bound of the answers and news that wait."""
 
 
-class Outbox:
+class ViewerOutbox:
     """A viewer's outbox. dropped: messages that newer ones replaced. overrun: the viewer has to be ended."""
 
     def __init__(self) -> None:
@@ -33,7 +33,7 @@ class Outbox:
         self._bytes = 0
 
     def __repr__(self) -> str:
-        return f"<Outbox of {len(self._controls)} + {len(self._order)} messages, {self._bytes} bytes>"
+        return f"<ViewerOutbox of {len(self._controls)} + {len(self._order)} messages, {self._bytes} bytes>"
 
     def __len__(self) -> int:
         return len(self._controls) + len(self._order)

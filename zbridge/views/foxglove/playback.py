@@ -11,16 +11,15 @@ import asyncio
 import contextlib
 import itertools
 from collections.abc import Iterator
-from typing import cast
 
 from zbridge.views.foxglove import replies
-from zbridge.views.foxglove.hub import Hub, Receiver
-from zbridge.views.foxglove.playback_clock import PlaybackClock
-from zbridge.views.foxglove.recording import Message, Recording
+from zbridge.views.foxglove.hub import Hub, Subscriber
+from zbridge.views.foxglove.recording import IndexedRecording, PlayedMessage
 from zbridge.views.foxglove.replies import PlaybackStatus
 from zbridge.views.foxglove.requests import PlaybackRequest
-from zbridge.views.foxglove.source import Person, Source
-from zbridge.views.pictures import Channel
+from zbridge.views.foxglove.source import ViewerSource
+from zbridge.views.pictures import ViewerChannel
+from zbridge.views.recording.player import PlaybackClock
 
 BATCH = 64
 """Messages that are read at once."""
@@ -34,10 +33,10 @@ RARE = ("foxglove.Grid", "zbridge.Status.v1", "zbridge.Control.v1", "zbridge.Sca
 _S_NS = 1_000_000_000
 
 
-class Playback(Source):
+class Playback(ViewerSource):
     """Plays a recording."""
 
-    def __init__(self, hub: Hub, recording: Recording) -> None:
+    def __init__(self, hub: Hub, recording: IndexedRecording) -> None:
         super().__init__(hub)
         self.capabilities = ("time", "playbackControl")
         self.times_ns = (recording.begin_ns, recording.end_ns)
@@ -45,10 +44,10 @@ class Playback(Source):
         self._clock = PlaybackClock(recording.begin_ns, recording.end_ns)
         self._loop = asyncio.get_running_loop()
         self._changed = asyncio.Event()
-        self._look_back: set[str] = set()
+        self._backfill: set[str] = set()
         """Topics whose last message before now is to be shown."""
         self._from_ns: int | None = recording.begin_ns
-        """Where reading begins anew; None while it goes on."""
+        """Where reading begins anew; None while it continues."""
         hub.offer(recording.channels.values())
         hub.on_wanted = self._on_wanted
         hub.on_subscribed = self._on_subscribed
@@ -58,12 +57,12 @@ class Playback(Source):
 
     # What viewers do
 
-    def greet(self, viewer: Person) -> None:
+    def greet(self, viewer: Subscriber) -> None:
         """Tell a new viewer what is being played."""
         viewer.say(self._state(sought=False, request_id=""))
         viewer.say(replies.time(self._now_ns()))
 
-    def play(self, viewer: Person, request: PlaybackRequest) -> None:
+    def play(self, viewer: Subscriber, request: PlaybackRequest) -> None:
         """Play or pause, from another time if one is named. The others are told without the id of the request."""
         now = self._loop.time()
         sought = request.seek_ns is not None or (request.play and self._clock.ended)
@@ -76,32 +75,32 @@ class Playback(Source):
             self._clock.speed = request.speed
         if sought:
             self._from_ns = self._clock.now_ns(now)
-            self._look_back.update(channel.topic for channel in self.hub.wanted())
+            self._backfill.update(channel.topic for channel in self.hub.wanted())
         viewer.say(self._state(sought=sought, request_id=request.request_id))
         others = self._state(sought=sought, request_id="")
         for other in self.hub.viewers:
-            if other is not cast(Receiver, viewer):
+            if other is not viewer:
                 other.say(others)
         self._changed.set()
 
-    def _on_wanted(self, channel: Channel, wanted: bool) -> None:
+    def _on_wanted(self, channel: ViewerChannel, wanted: bool) -> None:
         if wanted:
-            self._look_back.add(channel.topic)
+            self._backfill.add(channel.topic)
             self._changed.set()
 
-    def _on_subscribed(self, channel: Channel, viewer: Receiver, subscription: int) -> None:
+    def _on_subscribed(self, channel: ViewerChannel, viewer: Subscriber, subscription: int) -> None:
         self._on_wanted(channel, True)
 
     # What is shown
 
     async def run(self) -> None:
         """Show messages when their time comes, until cancelled."""
-        ahead: list[Message] = []
-        entries: Iterator[Message] = iter(())
-        told_at = 0.0
+        ahead: list[PlayedMessage] = []
+        entries: Iterator[PlayedMessage] = iter(())
+        sent_at = 0.0
         while True:
             self._changed.clear()
-            if self._look_back:
+            if self._backfill:
                 await self._show_last()
                 continue
             if self._from_ns is not None:  # what was recorded at this very time was shown as the last before it
@@ -116,12 +115,12 @@ class Playback(Source):
             while ahead and self._clock.playing and self._clock.wait_s(ahead[-1].log_ns, now) <= 0:
                 message = ahead.pop()
                 self.hub.publish(message.topic, message.log_ns, message.payload)
-            if self._clock.playing and now - told_at >= TICK_S:
-                told_at = now
-                self._tell_time(ended=not ahead)
-            await self._rest(ahead)
+            if self._clock.playing and now - sent_at >= TICK_S:
+                sent_at = now
+                self._send_time(ended=not ahead)
+            await self._wait(ahead)
 
-    async def _rest(self, ahead: list[Message]) -> None:
+    async def _wait(self, ahead: list[PlayedMessage]) -> None:
         """Wait for the next message, the next tick, or a viewer."""
         wait_s: float | None = None
         if self._clock.playing:
@@ -132,12 +131,12 @@ class Playback(Source):
             async with asyncio.timeout(wait_s):
                 await self._changed.wait()
 
-    def _hold_back(self, ahead: list[Message], now: float) -> None:
+    def _hold_back(self, ahead: list[PlayedMessage], now: float) -> None:
         """Let the clock wait where reading cannot keep up with it."""
         if ahead and self._clock.playing and self._clock.wait_s(ahead[-1].log_ns, now) < -LATE_S:
             self._clock.seek(ahead[-1].log_ns, now)
 
-    def _tell_time(self, *, ended: bool) -> None:
+    def _send_time(self, *, ended: bool) -> None:
         now_ns = self._now_ns()
         self.hub.say(replies.time(now_ns))
         if ended and now_ns >= self._clock.end_ns:
@@ -146,7 +145,7 @@ class Playback(Source):
 
     async def _show_last(self) -> None:
         """Show the last messages before now of the channels that wait for them."""
-        topics, self._look_back = self._look_back, set()
+        topics, self._backfill = self._backfill, set()
         channels = self._recording.channels
         rare = {topic for topic in topics if channels[topic].schema.name in RARE}
         at_ns = self._now_ns()
@@ -157,7 +156,7 @@ class Playback(Source):
         if not self._clock.playing:
             self.hub.say(replies.time(at_ns))
 
-    async def _read(self, entries: Iterator[Message]) -> list[Message]:
+    async def _read(self, entries: Iterator[PlayedMessage]) -> list[PlayedMessage]:
         return await asyncio.to_thread(lambda: list(itertools.islice(entries, BATCH)))
 
     def _now_ns(self) -> int:

@@ -14,7 +14,8 @@ import msgspec
 from mcap.reader import McapReader, NonSeekingReader, SeekingReader
 
 from zbridge.errors import ZbridgeError, describe
-from zbridge.views.pictures import Channel, Schema
+from zbridge.views.pictures import ViewerChannel
+from zbridge.views.schemas import Schema
 
 log = logging.getLogger("zbridge.foxglove")
 
@@ -32,7 +33,7 @@ _Entry = tuple[Any, Any, Any]
 """Schema, channel and message, as the library reads them."""
 
 
-class Message(msgspec.Struct, frozen=True, gc=False):
+class PlayedMessage(msgspec.Struct, frozen=True, gc=False):
     """A recorded message. log_ns: Unix nanoseconds."""
 
     topic: str
@@ -40,7 +41,7 @@ class Message(msgspec.Struct, frozen=True, gc=False):
     payload: bytes
 
 
-class Recording:
+class IndexedRecording:
     """A recording in a file; raises ZbridgeError, which names the file, if nothing of it can be shown.
 
     whole: whether it has an index. begin_ns, end_ns: its first and last time, Unix nanoseconds.
@@ -50,7 +51,7 @@ class Recording:
         self.path = path
         self.whole = True
         self.begin_ns = self.end_ns = 0
-        self.channels: dict[str, Channel] = {}
+        self.channels: dict[str, ViewerChannel] = {}
         try:
             with path.open("rb") as file:
                 self.whole = self._read_index(file)
@@ -62,9 +63,9 @@ class Recording:
             raise ZbridgeError(f"{path}: nothing in it that a viewer can show")
 
     def __repr__(self) -> str:
-        return f"<Recording {self.path}, {len(self.channels)} channels>"
+        return f"<IndexedRecording {self.path}, {len(self.channels)} channels>"
 
-    def messages(self, from_ns: int) -> Iterator[Message]:
+    def messages(self, from_ns: int) -> Iterator[PlayedMessage]:
         """Yield the messages from a time on, in the order of their times; of a cut recording as they were written.
 
         The first thing that cannot be read is the end. Raise OSError.
@@ -72,11 +73,11 @@ class Recording:
         with self.path.open("rb") as file:
             for _, channel, message in self._until_fault(file, starting_at=from_ns):
                 if channel.topic in self.channels:
-                    yield Message(channel.topic, message.log_time, message.data)
+                    yield PlayedMessage(channel.topic, message.log_time, message.data)
 
-    def last_before(self, topics: Iterable[str], at_ns: int, since_ns: int) -> list[Message]:
+    def last_before(self, topics: Iterable[str], at_ns: int, since_ns: int) -> list[PlayedMessage]:
         """Return the last message of each topic until a time, inclusive, but of none from before ``since_ns``."""
-        wanted, found = set(topics), dict[str, Message]()
+        wanted, found = set(topics), dict[str, PlayedMessage]()
         if not wanted or at_ns < since_ns:
             return []
         with self.path.open("rb") as file:
@@ -85,7 +86,7 @@ class Recording:
             )
             for _, channel, message in entries:
                 if not self.whole or channel.topic not in found:
-                    found[channel.topic] = Message(channel.topic, message.log_time, message.data)
+                    found[channel.topic] = PlayedMessage(channel.topic, message.log_time, message.data)
                 if self.whole and len(found) == len(wanted):
                     break
         return sorted(found.values(), key=lambda message: message.log_ns)
@@ -119,10 +120,10 @@ class Recording:
             return
         name, kind, data = (schema.name, schema.encoding, schema.data) if schema is not None else ("", "", b"")
         if len(data) <= SCHEMA_BYTES and len(name) <= TOPIC_CHARACTERS:
-            shown = Channel(channel.topic, channel.topic, Schema(name, kind, data, encoding))
+            shown = ViewerChannel(channel.topic, channel.topic, Schema(name, kind, data, encoding))
             self.channels.setdefault(channel.topic, shown)
 
-    def _until_fault(self, file: IO[bytes], **wish: Any) -> Iterator[_Entry]:
+    def _until_fault(self, file: IO[bytes], **filters: Any) -> Iterator[_Entry]:
         """Yield entries up to what cannot be read. The order of times needs the index."""
         try:
             reader: McapReader
@@ -130,7 +131,7 @@ class Recording:
                 reader = SeekingReader(file, record_size_limit=RECORD_BYTES)
             else:
                 reader = NonSeekingReader(file, record_size_limit=RECORD_BYTES)
-            yield from reader.iter_messages(log_time_order=self.whole, **wish)
+            yield from reader.iter_messages(log_time_order=self.whole, **filters)
         except OSError:
             raise
         except Exception as error:  # whatever the library raises; a cut is the usual cause

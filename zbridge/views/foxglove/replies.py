@@ -1,4 +1,4 @@
-"""What the server says in ``foxglove.sdk.v1``: text messages as ``str``, binary ones as ``bytes``. Sans-IO."""
+"""What the server sends in ``foxglove.sdk.v1``: text messages as ``str``, binary ones as ``bytes``. Sans-IO."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from typing import Any
 import msgspec
 
 from zbridge.views.foxglove.requests import ServiceCall
-from zbridge.views.pictures import Channel, Schema
+from zbridge.views.pictures import ViewerChannel
+from zbridge.views.schemas import Schema
 
 SUBPROTOCOL = "foxglove.sdk.v1"
 _S_NS = 1_000_000_000
 
 
-class Level(IntEnum):
+class StatusLevel(IntEnum):
     """How bad the news of a ``status`` is."""
 
     INFO = 0
@@ -63,7 +64,7 @@ def server_info(
     return _text(fields)
 
 
-def channel_entry(channel_id: int, channel: Channel) -> msgspec.Raw:
+def channel_entry(channel_id: int, channel: ViewerChannel) -> msgspec.Raw:
     """Write a channel as ``advertise`` lists it; a binary schema as base64."""
     schema = channel.schema
     return msgspec.Raw(
@@ -95,7 +96,7 @@ def message_data(subscription_id: int, log_ns: int, payload: bytes) -> bytes:
     return _MESSAGE.pack(1, subscription_id, log_ns) + payload
 
 
-def status(level: Level, text: str, name: str | None = None) -> str:
+def status(level: StatusLevel, text: str, name: str | None = None) -> str:
     """Tell people something. name: of what holds until :func:`remove_status`, or until it is told anew."""
     named = {"id": name} if name is not None else {}
     return _text({"op": "status", "level": int(level), "message": text} | named)

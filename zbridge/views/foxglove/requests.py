@@ -1,4 +1,4 @@
-"""What viewers say in ``foxglove.sdk.v1``, Foxglove's WebSocket protocol. Sans-IO.
+"""What viewers send in ``foxglove.sdk.v1``, Foxglove's WebSocket protocol. Sans-IO.
 
 Text messages are JSON objects with an ``op``; binary ones begin with an opcode, and their numbers are little-endian.
 Reading raises ProtocolError and nothing else.
@@ -122,7 +122,7 @@ class ServiceCall(msgspec.Struct, frozen=True):
 
 
 class PlaybackRequest(msgspec.Struct, frozen=True):
-    """Play or pause a recording, at so many times its speed; seek_ns: Unix nanoseconds, None: go on from here."""
+    """Play or pause a recording, at so many times its speed; seek_ns: Unix nanoseconds, None: continue from here."""
 
     play: bool
     speed: float
@@ -130,7 +130,7 @@ class PlaybackRequest(msgspec.Struct, frozen=True):
     request_id: str
 
 
-Said = (
+TextMessage = (
     Subscribe
     | Unsubscribe
     | Advertise
@@ -140,16 +140,16 @@ Said = (
     | SubscribeParameterUpdates
     | UnsubscribeParameterUpdates
 )
-_SAID: msgspec.json.Decoder[Said] = msgspec.json.Decoder(Said)
+_TEXT_MESSAGES: msgspec.json.Decoder[TextMessage] = msgspec.json.Decoder(TextMessage)
 _U32 = struct.Struct("<I")
 _CALL = struct.Struct("<III")
 _PLAYBACK = struct.Struct("<BfBQI")
 
 
-def read_text(text: str) -> Said:
+def read_text(text: str) -> TextMessage:
     """Read a viewer's text message."""
     try:
-        return _SAID.decode(text)
+        return _TEXT_MESSAGES.decode(text)
     except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
         raise ProtocolError(f"text message: {error}") from error
 

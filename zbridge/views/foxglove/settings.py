@@ -1,4 +1,4 @@
-"""What ``zbridge foxglove`` is told on its command line, checked as a whole before anything starts."""
+"""The options of ``zbridge foxglove``, checked as a whole before anything starts."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TOKEN_CHARACTERS = 16
 """The shortest token."""
 
 
-class Options(msgspec.Struct, frozen=True):
+class FoxgloveOptions(msgspec.Struct, frozen=True):
     """The options as they are given; the command's help says what each is."""
 
     listen: str = "127.0.0.1:8765"
@@ -38,7 +38,7 @@ class Options(msgspec.Struct, frozen=True):
     metrics: str = ""
 
 
-class Plan(msgspec.Struct, frozen=True):
+class FoxglovePlan(msgspec.Struct, frozen=True):
     """What the server starts from. tls: certificate and key."""
 
     address: Address
@@ -49,7 +49,7 @@ class Plan(msgspec.Struct, frozen=True):
     metrics: Address | None = None
 
 
-def plan(options: Options) -> Plan:
+def plan(options: FoxgloveOptions) -> FoxglovePlan:
     """Check the options; raise ConfigError, which names the option."""
     address = _address("--listen", options.listen)
     if (options.tls_certificate is None) != (options.tls_key is None):
@@ -75,7 +75,7 @@ def plan(options: Options) -> Plan:
         who=options.who,
     )
     metrics = _address("--metrics", options.metrics) if options.metrics else None
-    return Plan(address, policy, _scales(options), frozenset(options.robots), tls, metrics)
+    return FoxglovePlan(address, policy, _scales(options), frozenset(options.robots), tls, metrics)
 
 
 def _address(option: str, text: str) -> Address:
@@ -101,7 +101,7 @@ def _origin(text: str) -> str:
     return text
 
 
-def _scales(options: Options) -> Scales:
+def _scales(options: FoxgloveOptions) -> Scales:
     speeds = _by_robot("--speed-full-mps", options.speed_full_mps)
     turns = _by_robot("--turn-full-radps", options.turn_full_radps)
     others = Scale(speeds.get("", Scale().speed_full_mps), turns.get("", Scale().turn_full_radps))

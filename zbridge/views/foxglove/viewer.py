@@ -1,7 +1,7 @@
-"""One viewer: reads what it says, asks the source to carry it out, and sends what waits for it.
+"""One viewer: reads its messages, asks the source to carry them out, and sends what waits for it.
 
 A message that cannot be read or carried out is counted, and the person is told why; it ends nothing. A viewer that
-says more than ``RATE_HZ`` a second, or lets answers wait, is ended. Knows no bus and no file.
+sends more than ``RATE_HZ`` a second, or lets answers wait, is closed. Knows no bus and no file.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from zbridge.errors import BusError, ProtocolError, Refused, Unsupported, descri
 from zbridge.fleet.printable import shown
 from zbridge.protocol.rate_limit import RateLimit
 from zbridge.views.foxglove import replies, requests
-from zbridge.views.foxglove.outbox import Outbox
-from zbridge.views.foxglove.replies import Level
+from zbridge.views.foxglove.outbox import ViewerOutbox
+from zbridge.views.foxglove.replies import StatusLevel
 from zbridge.views.foxglove.requests import ClientChannel, ServiceCall
-from zbridge.views.foxglove.source import Source
+from zbridge.views.foxglove.source import ViewerSource
 
 log = logging.getLogger("zbridge.foxglove")
 
 RATE_HZ = 500.0
-"""Most messages a second of one viewer; one that says more is ended."""
-TOLD_HZ = 5.0
+"""Most messages a second of one viewer; one that sends more is closed."""
+WARNINGS_HZ = 5.0
 """Most warnings a second; the rest are only counted."""
 SEND_S = 30.0
-"""A viewer that takes nothing for so long is ended, by TimeoutError."""
+"""A viewer that is stalled for so long is closed, by TimeoutError."""
 CALLS = 8
 """Most calls of one viewer that are carried out at the same time."""
 SUBSCRIPTIONS = 4096
@@ -42,11 +42,11 @@ class Overrun(Exception):
     """The viewer broke a limit and is ended."""
 
 
-class Connection(Protocol):
+class ViewerConnection(Protocol):
     """A WebSocket connection, as a viewer needs it."""
 
     def __aiter__(self) -> AsyncIterator[str | bytes]:
-        """Give what the viewer says, until it is gone."""
+        """Yield the messages of the viewer, until it is gone."""
 
     def send_now(self, message: bytes) -> bool:
         """Send a message without waiting; False if it would have to wait."""
@@ -59,21 +59,27 @@ class Viewer:
     """A viewer of a source. name: shown to others as the driver. may_drive: whether its commands are carried out."""
 
     def __init__(
-        self, name: str, source: Source, connection: Connection, *, may_drive: bool, clock: Callable[[], float]
+        self,
+        name: str,
+        source: ViewerSource,
+        connection: ViewerConnection,
+        *,
+        may_drive: bool,
+        clock: Callable[[], float],
     ) -> None:
         self.name = name
         self.may_drive = may_drive
         self.counts: Counter[str] = Counter()
-        """What was said, dropped and refused."""
+        """Messages received (``said``), dropped and refused."""
         self._source = source
         self._hub = source.hub
         self._connection = connection
         self._clock = clock
-        self._outbox = Outbox()
+        self._outbox = ViewerOutbox()
         self._filled = asyncio.Event()
         self._sending_since = math.inf
         self._rate = RateLimit(RATE_HZ)
-        self._told = RateLimit(TOLD_HZ)
+        self._warned = RateLimit(WARNINGS_HZ)
         self._channels: dict[int, int] = {}
         """The channel of each subscription."""
         self._subscribed: set[int] = set()
@@ -89,7 +95,7 @@ class Viewer:
         """Serve the viewer until it is gone; raise Overrun or TimeoutError if it has to be ended."""
         self.say(self._source.info())
         self._hub.join(self)
-        services = self._source.services()
+        services = self._source.commands.services()
         if services:
             self.say(replies.advertise_services(services))
         self._source.greet(self)
@@ -125,16 +131,16 @@ class Viewer:
 
     def warn(self, text: str) -> None:
         """Tell the person that something was not done, a few times a second at most."""
-        if self._told.take(self._clock()):
-            self.say(replies.status(Level.WARNING, shown(text)))
+        if self._warned.take(self._clock()):
+            self.say(replies.status(StatusLevel.WARNING, shown(text)))
 
     def parameters_changed(self, values: Mapping[str, Any]) -> None:
         """Tell parameters that the viewer watches."""
         if self._watched is None:
             return
-        told = {name: value for name, value in values.items() if not self._watched or name in self._watched}
-        if told:
-            self.say(replies.parameter_values(told))
+        watched = {name: value for name, value in values.items() if not self._watched or name in self._watched}
+        if watched:
+            self.say(replies.parameter_values(watched))
 
     async def _write(self) -> None:
         outbox, send = self._outbox, self._connection.send
@@ -147,7 +153,7 @@ class Viewer:
             self._sending_since = math.inf
 
     async def _watch_writing(self) -> None:
-        """Raise TimeoutError when the viewer takes nothing; a timer for each message would cost more than it."""
+        """Raise TimeoutError when the viewer is stalled; a timer for each message would cost more than it."""
         for _ in iter(lambda: self._clock() - self._sending_since < SEND_S, False):
             await asyncio.sleep(SEND_S / 4)
         raise TimeoutError
@@ -160,7 +166,7 @@ class Viewer:
             if not self._rate.take(self._clock()):
                 raise Overrun(f"more than {RATE_HZ:g} messages a second")
             try:
-                self._take(message)
+                self._handle(message)
             except ProtocolError as error:
                 self.counts["malformed"] += 1
                 self.warn(str(error))
@@ -175,75 +181,74 @@ class Viewer:
         log.debug("%s: %s", self.name, why)
         self.warn(str(why))
 
-    def _take(self, message: str | bytes) -> None:
+    def _handle(self, message: str | bytes) -> None:
         if isinstance(message, str):
-            said = requests.read_text(message)
-            _TEXTS[type(said)](self, said)
+            text = requests.read_text(message)
+            _HANDLERS[type(text)](self, text)
             return
         match requests.read_binary(message):
             case requests.Published(channel_id, payload):
                 if (channel := self._published.get(channel_id)) is None:
                     raise Unsupported(f"channel {channel_id} is not one of yours")
-                self._source.published(self, channel, payload)
+                self._source.commands.published(self, channel, payload)
             case ServiceCall() as call:
                 if not self._start(self._call(call)):
                     self.say(replies.service_failure(call, f"more than {CALLS} calls at the same time"))
             case requests.PlaybackRequest() as request:
                 self._source.play(self, request)
 
-    def _subscribe(self, said: requests.Subscribe) -> None:
-        for wish in said.subscriptions:
-            if wish.id in self._channels or wish.channel_id in self._subscribed:
-                self.refuse(Unsupported(f"channel {wish.channel_id} or subscription {wish.id} is subscribed already"))
+    def _subscribe(self, request: requests.Subscribe) -> None:
+        for wanted in request.subscriptions:
+            if wanted.id in self._channels or wanted.channel_id in self._subscribed:
+                self.refuse(
+                    Unsupported(f"channel {wanted.channel_id} or subscription {wanted.id} is subscribed already")
+                )
             elif len(self._channels) >= SUBSCRIPTIONS:
                 self.refuse(Unsupported(f"more than {SUBSCRIPTIONS} subscriptions"))
-            elif not self._hub.subscribe(self, wish.id, wish.channel_id):
-                self.refuse(Unsupported(f"there is no channel {wish.channel_id}"))
+            elif not self._hub.subscribe(self, wanted.id, wanted.channel_id):
+                self.refuse(Unsupported(f"there is no channel {wanted.channel_id}"))
             else:
-                self._channels[wish.id] = wish.channel_id
-                self._subscribed.add(wish.channel_id)
+                self._channels[wanted.id] = wanted.channel_id
+                self._subscribed.add(wanted.channel_id)
 
-    def _unsubscribe(self, said: requests.Unsubscribe) -> None:
-        for subscription in said.subscription_ids:
+    def _unsubscribe(self, request: requests.Unsubscribe) -> None:
+        for subscription in request.subscription_ids:
             channel_id = self._channels.pop(subscription, None)
             if channel_id is not None:
                 self._subscribed.discard(channel_id)
                 self._hub.unsubscribe(self, channel_id)
                 self._outbox.forget(subscription)
 
-    def _advertise(self, said: requests.Advertise) -> None:
+    def _advertise(self, request: requests.Advertise) -> None:
         """Take note of any channel: viewers announce some that they never use. What comes on it is judged then."""
-        for channel in said.channels:
+        for channel in request.channels:
             if channel.id in self._published or len(self._published) >= PUBLISHED:
                 self.refuse(Unsupported(f"channel {channel.id} is there already, or there are {PUBLISHED}"))
             else:
                 self._published[channel.id] = channel
 
-    def _unadvertise(self, said: requests.Unadvertise) -> None:
-        for channel_id in said.channel_ids:
+    def _unadvertise(self, request: requests.Unadvertise) -> None:
+        for channel_id in request.channel_ids:
             channel = self._published.pop(channel_id, None)
             if channel is not None:
-                self._source.unpublished(self, channel)
+                self._source.commands.unpublished(self, channel)
 
-    def _get(self, said: requests.GetParameters) -> None:
-        self._start(self._tell_parameters(said.parameter_names, said.id))
-
-    def _set(self, said: requests.SetParameters) -> None:
-        if not self._start(self._set_parameters(said)):
+    def _set(self, request: requests.SetParameters) -> None:
+        if not self._start(self._set_parameters(request)):
             raise Unsupported(f"more than {CALLS} calls at the same time")
 
-    def _watch(self, said: requests.SubscribeParameterUpdates) -> None:
+    def _watch(self, request: requests.SubscribeParameterUpdates) -> None:
         if self._watched is None:
-            self._watched = set(said.parameter_names)
+            self._watched = set(request.parameter_names)
             self._source.watch_parameters(True)
         elif self._watched:
-            names = self._watched | set(said.parameter_names) if said.parameter_names else set()
+            names = self._watched | set(request.parameter_names) if request.parameter_names else set()
             self._watched = names if len(names) <= requests.LISTED else set()
 
-    def _unwatch(self, said: requests.UnsubscribeParameterUpdates) -> None:
+    def _unwatch(self, request: requests.UnsubscribeParameterUpdates) -> None:
         if self._watched is None:
             return
-        left = self._watched - set(said.parameter_names) if said.parameter_names else set()
+        left = self._watched - set(request.parameter_names) if request.parameter_names else set()
         self._watched = left or None
         if self._watched is None:
             self._source.watch_parameters(False)
@@ -265,23 +270,25 @@ class Viewer:
         try:
             if call.encoding != "json":
                 raise Unsupported(f"encoding {call.encoding[:16]!r}: expected 'json'")
-            payload = await self._source.call(self, call.service_id, call.payload)
+            payload = await self._source.commands.call(self, call.service_id, call.payload)
         except (Refused, BusError, ProtocolError) as error:
             self.counts["refused"] += 1
             self.say(replies.service_failure(call, shown(error)))
         else:
             self.say(replies.service_response(call, payload))
 
-    async def _set_parameters(self, said: requests.SetParameters) -> None:
-        for parameter in said.parameters:
+    async def _set_parameters(self, request: requests.SetParameters) -> None:
+        for parameter in request.parameters:
             try:
-                await self._source.set_parameter(self, parameter.name, parameter.value)
+                await self._source.commands.set_parameter(self, parameter.name, parameter.value)
             except (Refused, BusError, ProtocolError) as error:
                 self.refuse(error)
-        if said.id is not None:
-            await self._tell_parameters(tuple(parameter.name for parameter in said.parameters), said.id, ask=False)
+        if request.id is not None:
+            await self._send_parameters(
+                tuple(parameter.name for parameter in request.parameters), request.id, ask=False
+            )
 
-    async def _tell_parameters(self, names: tuple[str, ...], request_id: str | None, *, ask: bool = True) -> None:
+    async def _send_parameters(self, names: tuple[str, ...], request_id: str | None, *, ask: bool = True) -> None:
         self.say(replies.parameter_values(await self._source.parameters(names, ask=ask), request_id))
 
     async def _leave(self) -> None:
@@ -290,18 +297,18 @@ class Viewer:
         if self._watched is not None:
             self._source.watch_parameters(False)
         try:
-            await self._source.left(self)
-        except Exception as error:  # the others must go on
+            await self._source.commands.left(self)
+        except Exception as error:  # the others must continue
             log.error("%s left: %s", self.name, describe(error))
 
 
-_Take = Callable[[Viewer, Any], None]
-_TEXTS: Mapping[type, _Take] = {
+_Handler = Callable[[Viewer, Any], object]
+_HANDLERS: Mapping[type, _Handler] = {
     requests.Subscribe: Viewer._subscribe,
     requests.Unsubscribe: Viewer._unsubscribe,
     requests.Advertise: Viewer._advertise,
     requests.Unadvertise: Viewer._unadvertise,
-    requests.GetParameters: Viewer._get,
+    requests.GetParameters: lambda viewer, get: viewer._start(viewer._send_parameters(get.parameter_names, get.id)),
     requests.SetParameters: Viewer._set,
     requests.SubscribeParameterUpdates: Viewer._watch,
     requests.UnsubscribeParameterUpdates: Viewer._unwatch,

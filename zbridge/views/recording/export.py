@@ -17,8 +17,8 @@ from zbridge.errors import ConfigError, PayloadError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import FleetMessage, Pose, Scan
 from zbridge.fleet.topics import split_key
-from zbridge.views.recording.channels import MSGPACK, OCTETS, message_of
-from zbridge.views.recording.reader import Message, Reader, open_recording
+from zbridge.views.recording.contents import MSGPACK, OCTETS, message_of
+from zbridge.views.recording.reader import RecordedMessage, RecordingReader, open_recording
 from zbridge.views.recording.selection import Selection
 
 if TYPE_CHECKING:
@@ -31,6 +31,7 @@ TABLES = 10_000
 ARRAY_BYTES = 2**31
 """Bytes of all arrays of an export, which are in memory."""
 _TIMES = ("log_ns", "publish_ns")
+_ARRAY_TIMES = ("log_ns", "stamp_ns")
 
 
 class Export(msgspec.Struct):
@@ -45,7 +46,7 @@ class Export(msgspec.Struct):
 def first_ns(path: Path) -> int:
     """Return the log time of the first message; 0 where there is none."""
     with open_recording(path) as file:
-        return next((message.log_ns for message in Reader(file).messages()), 0)
+        return next((message.log_ns for message in RecordingReader(file).messages()), 0)
 
 
 def export_tables(path: Path, folder: Path, selection: Selection) -> Export:
@@ -78,8 +79,8 @@ def export_arrays(path: Path, output: Path, selection: Selection) -> Export:
     import numpy as np
 
     done = Export()
-    poses: dict[str, _Poses] = {}
-    scans: dict[str, _Scans] = {}
+    poses: dict[str, _Columns] = {}
+    scans: dict[str, _Columns] = {}
     size = 0
     for message in _chosen(path, selection, done):
         split = split_key(message.channel.topic)
@@ -96,30 +97,26 @@ def export_arrays(path: Path, output: Path, selection: Selection) -> Export:
             raise ConfigError(
                 f"more than {ARRAY_BYTES} bytes of scans and poses: choose some by --keys, --from and --to"
             )
-        if isinstance(decoded, Pose):
-            poses.setdefault(split[1], _Poses()).add(message, decoded)
-        elif isinstance(decoded, Scan):
-            scans.setdefault(split[1], _Scans()).add(message, decoded)
+        (poses if kind is Pose else scans).setdefault(split[1], _Columns(kind)).add(message, decoded)
         done.messages += 1
     arrays: dict[str, Any] = {}
-    for robot, pose in poses.items():
-        arrays |= {f"{robot}/pose/{name}": values for name, values in pose.arrays(np).items()}
-    for robot, scan in scans.items():
-        arrays |= {f"{robot}/scan/{name}": values for name, values in scan.arrays(np).items()}
+    for what, robots in (("pose", poses), ("scan", scans)):
+        for robot, columns in robots.items():
+            arrays |= {f"{robot}/{what}/{name}": values for name, values in columns.arrays(np).items()}
     with output.open("xb") as file:
         np.savez_compressed(file, **arrays)
     done.files = 1
     return done
 
 
-def _chosen(path: Path, selection: Selection, done: Export) -> Iterator[Message]:
+def _chosen(path: Path, selection: Selection, done: Export) -> Iterator[RecordedMessage]:
     with open_recording(path) as file:
-        reader = Reader(file)
-        yield from filter(selection.takes, reader.messages())
+        reader = RecordingReader(file)
+        yield from filter(selection.includes, reader.messages())
         done.fault = None if reader.ended else reader.fault
 
 
-def _row(message: Message) -> tuple[tuple[str, ...], list[Any]]:
+def _row(message: RecordedMessage) -> tuple[tuple[str, ...], list[Any]]:
     """Return the columns and the values of a message; raise PayloadError."""
     if message.channel.encoding == OCTETS:
         return ("octets",), [message.data.hex()]
@@ -195,53 +192,33 @@ class _Tables:
         return self._folder.joinpath(*(chunk[:100] for chunk in chunks[:16])).with_suffix(".csv")
 
 
-class _Poses:
-    """The poses of one robot."""
+class _Columns:
+    """The poses or scans of one robot, column by column; scans with fewer points are filled up with NaN."""
 
-    def __init__(self) -> None:
+    def __init__(self, kind: type[FleetMessage]) -> None:
         self._times = (array("Q"), array("Q"))
-        self._columns = {"x": array("d"), "y": array("d"), "heading": array("d")}
+        names = ("x", "y", "heading") if kind is Pose else ("angle_min", "angle_increment")
+        self._columns = {name: array("d") for name in names}
+        self._ranges: list[Any] = []
 
-    def add(self, message: Message, pose: Pose) -> None:
+    def add(self, message: RecordedMessage, decoded: FleetMessage) -> None:
         for times, value in zip(self._times, (message.log_ns, message.publish_ns), strict=True):
             times.append(value)
         for name, column in self._columns.items():
-            column.append(getattr(pose, name))
+            column.append(getattr(decoded, name))
+        if isinstance(decoded, Scan):
+            self._ranges.append(decoded.ranges)
 
     def arrays(self, np: Any) -> dict[str, np.ndarray]:
-        return {
-            "log_ns": np.array(self._times[0]).astype(np.int64),
-            "stamp_ns": np.array(self._times[1]).astype(np.int64),
-            **{name: np.array(column) for name, column in self._columns.items()},
-        }
+        arrays = {name: np.array(each).astype(np.int64) for name, each in zip(_ARRAY_TIMES, self._times, strict=True)}
+        arrays |= {name: np.array(column) for name, column in self._columns.items()}
+        return arrays | ({"ranges": self._filled(np)} if self._ranges else {})
 
-
-class _Scans:
-    """The scans of one robot; those with fewer points are filled up with NaN."""
-
-    def __init__(self) -> None:
-        self._times = (array("Q"), array("Q"))
-        self._angles = (array("d"), array("d"))
-        self._ranges: list[Any] = []
-
-    def add(self, message: Message, scan: Scan) -> None:
-        for times, value in zip(self._times, (message.log_ns, message.publish_ns), strict=True):
-            times.append(value)
-        for angles, angle in zip(self._angles, (scan.angle_min, scan.angle_increment), strict=True):
-            angles.append(angle)
-        self._ranges.append(scan.ranges)
-
-    def arrays(self, np: Any) -> dict[str, np.ndarray]:
+    def _filled(self, np: Any) -> Any:
         points = max(map(len, self._ranges))
         if points * len(self._ranges) * 4 > ARRAY_BYTES:
             raise ConfigError(f"more than {ARRAY_BYTES} bytes of scans: choose some by --keys, --from and --to")
-        ranges = np.full((len(self._ranges), points), np.nan, np.float32)
-        for row, scan in zip(ranges, self._ranges, strict=True):
+        filled = np.full((len(self._ranges), points), np.nan, np.float32)
+        for row, scan in zip(filled, self._ranges, strict=True):
             row[: len(scan)] = scan
-        return {
-            "log_ns": np.array(self._times[0]).astype(np.int64),
-            "stamp_ns": np.array(self._times[1]).astype(np.int64),
-            "angle_min": np.array(self._angles[0]),
-            "angle_increment": np.array(self._angles[1]),
-            "ranges": ranges,
-        }
+        return filled

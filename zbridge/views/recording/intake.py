@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 
 import msgspec
@@ -30,25 +31,12 @@ class Arrival(msgspec.Struct, frozen=True, gc=False):
     attachment: bytes | None = None
 
 
-class Losses:
+class Losses(Counter[str]):
     """Messages lost, by key. One thread adds."""
-
-    def __init__(self) -> None:
-        self.by_key: dict[str, int] = {}
-
-    def __repr__(self) -> str:
-        return f"<Losses {self.total} of {len(self.by_key)} keys>"
-
-    @property
-    def total(self) -> int:
-        """Messages lost on all keys."""
-        return sum(self.by_key.values())
 
     def add(self, key: str, count: int = 1) -> None:
         """Count lost messages of one key."""
-        if key not in self.by_key and len(self.by_key) >= KEYS:
-            key = OTHERS
-        self.by_key[key] = self.by_key.get(key, 0) + count
+        self[key if key in self or len(self) < KEYS else OTHERS] += count
 
 
 class Intake:
@@ -64,22 +52,22 @@ class Intake:
         self._taken = 0
 
     def __repr__(self) -> str:
-        return f"<Intake {len(self._waiting)} waiting, {self.dropped.total} dropped>"
+        return f"<Intake {len(self._waiting)} waiting, {self.dropped.total()} dropped>"
 
     def put(self, key: str, payload: bytes, attachment: bytes | None = None) -> bool:
         """Queue a message, from any thread; False where it was dropped. Arrival times rise along the queue."""
         size = len(payload) + (len(attachment) if attachment is not None else 0)
-        return self.put_seen(key, size, lambda: payload, attachment)
+        return self.put_sized(key, size, lambda: payload, attachment)
 
-    def put_seen(self, key: str, size: int, look: Callable[[], bytes], attachment: bytes | None) -> bool:
-        """Queue a message of ``size`` bytes, whose payload is looked at only where there is room for it."""
+    def put_sized(self, key: str, size: int, read_payload: Callable[[], bytes], attachment: bytes | None) -> bool:
+        """Queue a message of ``size`` bytes, whose payload is read only where there is room for it."""
         size += OVERHEAD_BYTES
         with self._lock:
             if self._bytes + size > self._bound:
                 self.dropped.add(key)
                 return False
             self._bytes += size
-            self._waiting.append(Arrival(self._clock_ns(), key, look(), attachment))
+            self._waiting.append(Arrival(self._clock_ns(), key, read_payload(), attachment))
         return True
 
     def take(self) -> list[Arrival]:

@@ -1,8 +1,8 @@
 """Plays a recording: calls back with each message when it is due. A thread of its own, for it keeps time more exactly.
 
-Theory of operation. :class:`Pace` says when a moment of the recording is due, and has no clock. The :class:`Player`
-reads one message after the other, sleeps until it is due, and hands it on. A message whose time is before the one that
-stands before it is due at once. A pause moves all that follows by its length.
+Theory of operation. :class:`PlaybackClock` tells the time of the recording. The :class:`Player` reads one message after
+the other, sleeps until it is due, and hands it on. A message whose time is before that of its predecessor is due
+at once. A pause moves all that follows by its length.
 """
 
 from __future__ import annotations
@@ -14,59 +14,70 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from zbridge.views.recording.reader import Message, Reader, open_recording
+from zbridge.views.recording.reader import RecordedMessage, RecordingReader, open_recording
 from zbridge.views.recording.selection import Selection
 
 log = logging.getLogger("zbridge.views.recording")
 
-NAP_S = 0.05
-"""Longest sleep between two looks at a pause or an end."""
+POLL_S = 0.05
+"""Longest sleep between two checks for a pause or an end."""
 
 
-class Pace:
-    """When a moment of the recording is due. speed: seconds of the recording per second. Sans-IO."""
+class PlaybackClock:
+    """The time of a recording that is played: runs, pauses, jumps. Sans-IO; real time is an argument, seconds.
 
-    def __init__(self, speed: float = 1.0) -> None:
-        self._speed = speed
-        self._begun = 0.0
-        self._first_ns: int | None = None
-        self._paused_at: float | None = None
+    It is paused at the begin until :meth:`play`. begin_ns, end_ns: the first and the last time of the recording.
+    """
+
+    def __init__(self, begin_ns: int, end_ns: int) -> None:
+        self.begin_ns = begin_ns
+        self.end_ns = end_ns
+        self.playing = False
+        self.speed = 1.0
+        self._at_ns = begin_ns
+        self._since = 0.0
 
     def __repr__(self) -> str:
-        return f"<Pace {self._speed:g}{' paused' if self.paused else ''}>"
+        return f"<PlaybackClock {'playing' if self.playing else 'paused'} at {self._at_ns} x {self.speed:g}>"
 
     @property
-    def paused(self) -> bool:
-        """Whether nothing is due."""
-        return self._paused_at is not None
+    def ended(self) -> bool:
+        """Whether it is paused at the end."""
+        return not self.playing and self._at_ns >= self.end_ns
 
-    def begin(self, first_ns: int, now: float) -> None:
-        """Begin: this moment is due now."""
-        self._first_ns, self._begun = first_ns, now
-        if self._paused_at is not None:
-            self._paused_at = now
+    def now_ns(self, now: float) -> int:
+        """Return the time of the recording."""
+        if not self.playing:
+            return self._at_ns
+        return min(self.end_ns, self._at_ns + int((now - self._since) * self.speed * 1e9))
 
-    def due(self, log_ns: int) -> float:
-        """Return when a moment is due, were there no further pause; the first moment asked for begins at 0."""
-        assert self._first_ns is not None
-        return self._begun + (log_ns - self._first_ns) / 1e9 / self._speed
+    def play(self, speed: float, now: float) -> None:
+        """Run from here on, at so many times the recording's speed; from the begin where it has ended."""
+        at_ns = self.now_ns(now)
+        self._set(self.begin_ns if self.ended else at_ns, now)
+        self.playing, self.speed = True, speed
 
     def pause(self, now: float) -> None:
-        """Let nothing be due until :meth:`resume`; idempotent."""
-        if self._paused_at is None:
-            self._paused_at = now
+        """Pause here."""
+        self._set(self.now_ns(now), now)
+        self.playing = False
 
-    def resume(self, now: float) -> None:
-        """Go on where it was paused; idempotent."""
-        if self._paused_at is not None:
-            self._begun += now - self._paused_at
-            self._paused_at = None
+    def seek(self, to_ns: int, now: float) -> None:
+        """Jump, within the recording."""
+        self._set(max(self.begin_ns, min(self.end_ns, to_ns)), now)
+
+    def wait_s(self, for_ns: int, now: float) -> float:
+        """Return the real time until a time of the recording; 0 or less if it is past."""
+        return (for_ns - self.now_ns(now)) / 1e9 / self.speed
+
+    def _set(self, at_ns: int, now: float) -> None:
+        self._at_ns, self._since = at_ns, now
 
 
 class Player:
     """Plays a file from :meth:`start` to its end or :meth:`close`. play: called on the player's thread.
 
-    ended: called there at the end, with what is wrong with the file, or None. skip: called with what stands before the
+    ended: called there at the end, with what is wrong with the file, or None. skip: called with what precedes the
     selected part.
     """
 
@@ -74,10 +85,10 @@ class Player:
         self,
         path: Path,
         selection: Selection,
-        play: Callable[[Message], object],
+        play: Callable[[RecordedMessage], object],
         ended: Callable[[str | None], object],
         *,
-        skip: Callable[[Message], object] = lambda message: None,
+        skip: Callable[[RecordedMessage], object] = lambda message: None,
         speed: float = 1.0,
         loop: bool = False,
         clock: Callable[[], float] = time.monotonic,
@@ -89,35 +100,37 @@ class Player:
         self._play = play
         self._ended = ended
         self._skip = skip
-        self._pace = Pace(speed)
+        self._time = PlaybackClock(0, 2**64)
+        self._speed = speed
         self._loop = loop
         self._clock = clock
+        self._time.play(speed, clock())
         self._sleep = sleep
         self._closing = False
         self._lock = threading.Lock()
         self._thread = threading.Thread(target=self._run, name="zbridge-replay", daemon=True)
 
     def __repr__(self) -> str:
-        return f"<Player {self._path.name} {self._pace!r}>"
+        return f"<Player {self._path.name} {self._time!r}>"
 
     @property
     def paused(self) -> bool:
         """Whether it waits for :meth:`resume`."""
-        return self._pace.paused
+        return not self._time.playing
 
     def start(self) -> None:
         """Begin to play."""
         self._thread.start()
 
     def pause(self) -> None:
-        """Stand still until :meth:`resume`; from any thread."""
+        """Pause until :meth:`resume`; from any thread."""
         with self._lock:
-            self._pace.pause(self._clock())
+            self._time.pause(self._clock())
 
     def resume(self) -> None:
-        """Go on; from any thread."""
+        """Continue; from any thread."""
         with self._lock:
-            self._pace.resume(self._clock())
+            self._time.play(self._speed, self._clock())
 
     def close(self, timeout_s: float = 2.0) -> None:
         """End, and wait for the thread; idempotent."""
@@ -142,18 +155,18 @@ class Player:
     def _play_once(self) -> str | None:
         begun = False
         with open_recording(self._path) as file:
-            reader = Reader(file)
+            reader = RecordingReader(file)
             for message in reader.messages():
                 if self._closing:
                     return None
-                if not self._selection.takes(message):
+                if not self._selection.includes(message):
                     if message.log_ns < self._selection.since_ns:
                         self._skip(message)
                     continue
                 if not begun:
                     begun = True
                     with self._lock:
-                        self._pace.begin(message.log_ns, self._clock())
+                        self._time.seek(message.log_ns, self._clock())
                 if not self._wait(message.log_ns):
                     return None
                 self._play(message)
@@ -164,9 +177,9 @@ class Player:
         """Sleep until a moment is due; False where the player ends."""
         while not self._closing:
             with self._lock:
-                wait_s = math.inf if self._pace.paused else self._pace.due(log_ns) - self._clock()
+                wait_s = math.inf if self.paused else self._time.wait_s(log_ns, self._clock())
             if wait_s > 0:
-                self._sleep(min(wait_s, NAP_S))
-            if wait_s <= NAP_S and not self._pace.paused:  # another look at the clock would only make it late
+                self._sleep(min(wait_s, POLL_S))
+            if wait_s <= POLL_S and not self.paused:  # reading the clock again would only make it late
                 return not self._closing
         return False

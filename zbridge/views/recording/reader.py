@@ -3,7 +3,7 @@
 Theory of operation. The reader never seeks and never trusts the summary at the end of a file. Records are framed by
 their length, which is checked before anything is read; their contents are read within the record. A chunk is
 decompressed to the size that it states, within :data:`CHUNK_BYTES`, and its checksum is compared. The first byte that
-cannot be understood ends the file: what stands before it was read, and :attr:`Reader.fault` says what is wrong.
+cannot be understood ends the file: what precedes it was read, and :attr:`RecordingReader.fault` names the damage.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import msgspec
 
 from zbridge.errors import ConfigError, ZbridgeError
 
+EXTRA = "needs the extra: pip install 'zbridge[foxglove]'"
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_BYTES = 64 * 2**20
 """Longest record that is read."""
@@ -40,7 +41,7 @@ class BrokenError(ZbridgeError):
     """A file is not what MCAP says."""
 
 
-class Channel(msgspec.Struct, frozen=True):
+class RecordedChannel(msgspec.Struct, frozen=True):
     """A channel of a file, with its schema's name and encoding."""
 
     topic: str
@@ -58,17 +59,17 @@ class Channel(msgspec.Struct, frozen=True):
         return hash((self.topic, self.encoding, self.schema))
 
 
-class Message(msgspec.Struct, frozen=True, gc=False):
+class RecordedMessage(msgspec.Struct, frozen=True, gc=False):
     """One message. log_ns, publish_ns: Unix time."""
 
-    channel: Channel
+    channel: RecordedChannel
     log_ns: int
     publish_ns: int
     sequence: int
     data: bytes
 
 
-class Reader:
+class RecordingReader:
     """Reads one file. :meth:`messages` may be called once for each reader."""
 
     def __init__(self, file: IO[bytes]) -> None:
@@ -80,13 +81,15 @@ class Reader:
         """Why the file could not be read further; None while nothing is wrong."""
         self._file = file
         self._schemas: dict[int, tuple[str, str]] = {}
-        self._channels: dict[int, Channel] = {}
+        self._channels: dict[int, RecordedChannel] = {}
         self._tables = 0
 
     def __repr__(self) -> str:
-        return f"<Reader {len(self._channels)} channels, {self.fault or ('ended' if self.ended else 'reading')}>"
+        return (
+            f"<RecordingReader {len(self._channels)} channels, {self.fault or ('ended' if self.ended else 'reading')}>"
+        )
 
-    def messages(self) -> Iterator[Message]:
+    def messages(self) -> Iterator[RecordedMessage]:
         """Yield the messages up to the end of the file, or to what cannot be read. Raises OSError."""
         try:
             if self._file.read(len(MAGIC)) != MAGIC:
@@ -95,7 +98,7 @@ class Reader:
         except BrokenError as error:
             self.fault = str(error)
 
-    def _records(self) -> Iterator[Message]:
+    def _records(self) -> Iterator[RecordedMessage]:
         while True:
             head = self._file.read(_HEAD.size)
             if len(head) < _HEAD.size:
@@ -114,9 +117,9 @@ class Reader:
             elif opcode == _MESSAGE_OP:
                 yield self._message(memoryview(content))
             else:
-                self._take(opcode, memoryview(content))
+                self._read_record(opcode, memoryview(content))
 
-    def _inner(self, data: bytes) -> Iterator[Message]:
+    def _inner(self, data: bytes) -> Iterator[RecordedMessage]:
         """Yield the messages of a chunk."""
         view, at, end = memoryview(data), 0, len(data)
         while at < end:
@@ -131,18 +134,18 @@ class Reader:
             if opcode == _MESSAGE_OP:
                 yield self._message(content)
             else:
-                self._take(opcode, content)
+                self._read_record(opcode, content)
 
-    def _message(self, content: memoryview) -> Message:
+    def _message(self, content: memoryview) -> RecordedMessage:
         if len(content) < _MESSAGE.size:
             raise BrokenError(f"a message of {len(content)} bytes")
         number, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(content)
         channel = self._channels.get(number)
         if channel is None:
             raise BrokenError(f"a message of channel {number}, which was not declared")
-        return Message(channel, log_ns, publish_ns, sequence, bytes(content[_MESSAGE.size :]))
+        return RecordedMessage(channel, log_ns, publish_ns, sequence, bytes(content[_MESSAGE.size :]))
 
-    def _take(self, opcode: int, content: memoryview) -> None:
+    def _read_record(self, opcode: int, content: memoryview) -> None:
         """Take a record that is no message; others than those known are skipped."""
         read = _RECORDS.get(opcode)
         if read is not None:
@@ -163,7 +166,7 @@ class Reader:
         if schema and schema not in self._schemas:
             raise BrokenError(f"channel {topic[:40]!r} has schema {schema}, which was not declared")
         name, schema_encoding = self._schemas.get(schema, ("", ""))
-        channel = Channel(topic, encoding, name, schema_encoding, metadata)
+        channel = RecordedChannel(topic, encoding, name, schema_encoding, metadata)
         known = self._channels.setdefault(number, channel)
         if known != channel:
             raise BrokenError(f"channel {number} is {known.topic[:40]!r}, and then {topic[:40]!r}")
@@ -215,10 +218,10 @@ class Fields:
         return pairs
 
 
-_RECORDS: dict[int, Callable[[Reader, Fields], None]] = {
-    _SCHEMA: Reader._schema,
-    _CHANNEL: Reader._channel,
-    _METADATA: Reader._metadata,
+_RECORDS: dict[int, Callable[[RecordingReader, Fields], None]] = {
+    _SCHEMA: RecordingReader._schema,
+    _CHANNEL: RecordingReader._channel,
+    _METADATA: RecordingReader._metadata,
 }
 
 
@@ -266,10 +269,9 @@ def _library(name: str) -> Any:
     try:
         return import_module(name)
     except ImportError as error:
-        raise ConfigError(f"a compressed recording {_EXTRA}") from error
+        raise ConfigError(f"a compressed recording {EXTRA}") from error
 
 
-_EXTRA = "needs the extra: pip install 'zbridge[foxglove]'"
 _DECOMPRESS: dict[str, Callable[[bytes, int], bytes]] = {"": lambda packed, size: packed, "zstd": _zstd, "lz4": _lz4}
 
 

@@ -2,7 +2,7 @@
 
 Theory of operation. Every :data:`PAUSE_S` the thread takes all that waits in the intake. A message goes to the channel
 of its key as it was; a command is followed by its sender; a message that has a picture by its pictures. Log time is the
-time of arrival, publish time the message's ``stamp_ns``. A disk that takes nothing more ends the recording: the files
+time of arrival, publish time the message's ``stamp_ns``. A disk that is full ends the recording: the files
 are ended with what they hold, ``error`` says why, and what still arrives is counted as lost.
 """
 
@@ -21,15 +21,14 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, Status
 from zbridge.fleet.topics import Delivery, Topic, split_key
-from zbridge.views.recording.channels import SENT, ChannelKind, Sent, channel_of, is_command, read_sender
-from zbridge.views.recording.files import CHANNELS, Tape
+from zbridge.views.recording.contents import SENT, ChannelKind, Pictures, Sent, channel_of, read_sender
 from zbridge.views.recording.intake import Arrival, Intake, Losses
-from zbridge.views.recording.pictures import Pictures
+from zbridge.views.recording.tape import CHANNELS, Tape
 
 log = logging.getLogger("zbridge.views.recording")
 
 PAUSE_S = 0.05
-"""Seconds between two looks at the intake."""
+"""Seconds between two reads of the intake."""
 ROBOTS = 4096
 """Most robots whose leases, states and descriptions are followed."""
 STATES = 16_384
@@ -52,7 +51,7 @@ _read_stamp = msgspec.msgpack.Decoder(_Stamp).decode
 class _Track:
     """One key of the recording. channel: its id in the file of ``number``."""
 
-    __slots__ = ("channel", "count", "kind", "number", "pictured", "seen", "seq", "topic")
+    __slots__ = ("channel", "count", "kind", "number", "seq", "topic")
 
     def __init__(self, kind: ChannelKind, topic: Topic | None) -> None:
         self.kind = kind
@@ -129,7 +128,7 @@ class Recorder:
             "too many channels": self.refused,
             "missing in the sequence": self.missing,
         }
-        return {reason: dict(losses.by_key) for reason, losses in reasons.items() if losses.total}
+        return {reason: dict(losses) for reason, losses in reasons.items() if losses}
 
     # The thread
 
@@ -145,7 +144,7 @@ class Recorder:
 
     def _work(self) -> None:
         while True:
-            ending = self._ending.wait(PAUSE_S)  # looked at first: what came before it is still written
+            ending = self._ending.wait(PAUSE_S)  # read first: what came before it is still written
             batch = self._intake.take()
             self._write_batch(batch)
             if ending:
@@ -251,7 +250,7 @@ class Recorder:
         return track
 
     def _write_sender(self, arrival: Arrival, publish_ns: int) -> None:
-        if not (self._fleet and is_command(arrival.key)):
+        if not (self._fleet and "/@cmd/" in arrival.key):
             return
         lease = read_sender(arrival.attachment)
         holders: Mapping[bytes, str] = self._holders.get(arrival.key.partition("/@cmd/")[0], {})

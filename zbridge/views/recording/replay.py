@@ -25,9 +25,9 @@ from zbridge.hq import Listener, ListenerPlan, RobotSubscription
 from zbridge.metrics import Metrics
 from zbridge.protocol.session_table import SessionTable
 from zbridge.robot.ownership import Claim, Ownership, Standing
-from zbridge.views.recording.channels import MSGPACK, is_wire
+from zbridge.views.recording.contents import MSGPACK, is_wire
 from zbridge.views.recording.player import Player
-from zbridge.views.recording.reader import Message, Reader, open_recording
+from zbridge.views.recording.reader import RecordedMessage, RecordingReader, open_recording
 from zbridge.views.recording.replayed_robot import KEYS, PROTOCOL, ReplayedRobot
 from zbridge.views.recording.selection import Selection
 from zbridge.views.recording.summary import robots_of
@@ -35,7 +35,7 @@ from zbridge.views.recording.wire_tape import wire_links
 
 CLAIM_S = 5.0
 """Longest time until the name of a replayed robot is claimed."""
-LOOKED_AT = 200_000
+SURVEYED = 200_000
 """Messages at the begin of a file that are looked through for robots."""
 SUFFIX = "-replay"
 
@@ -67,8 +67,8 @@ def survey(path: Path) -> Survey:
     keys: set[str] = set()
     statuses: dict[str, Status] = {}
     with open_recording(path) as file:
-        reader = Reader(file)
-        for _, message in zip(range(LOOKED_AT), reader.messages(), strict=False):
+        reader = RecordingReader(file)
+        for _, message in zip(range(SURVEYED), reader.messages(), strict=False):
             topic = message.channel.topic
             if message.channel.encoding == MSGPACK or is_wire(topic):
                 keys.add(topic)
@@ -129,7 +129,7 @@ def plan_listeners(wanted: Sequence[str]) -> tuple[ListenerPlan, ...]:
 class Replay:
     """One replay on a bus. :meth:`run` returns at its end."""
 
-    def __init__(self, bus: Bus, plan: ReplayPlan, told: Callable[[str], object] = lambda text: None) -> None:
+    def __init__(self, bus: Bus, plan: ReplayPlan, report: Callable[[str], object] = lambda text: None) -> None:
         self.fault: str | None = None
         """What is wrong with the file."""
         self.played = self.left_out = 0
@@ -138,10 +138,10 @@ class Replay:
         self.robots: dict[str, ReplayedRobot] = {}
         self._bus = bus
         self._plan = plan
-        self._told = told
+        self._report = report
         self._ended = asyncio.Event()
         self._loop = asyncio.get_running_loop()
-        self._earlier: dict[str, Message] = {}
+        self._earlier: dict[str, RecordedMessage] = {}
         self._targets: dict[str, tuple[ReplayedRobot, str] | None] = {}
         self.player = Player(
             plan.path, plan.selection, self._play, self._on_end, speed=plan.speed, loop=plan.loop, skip=self._skip
@@ -158,10 +158,9 @@ class Replay:
             watching = []
             for recorded, name in self._plan.names.items():
                 ownership = await stack.enter_async_context(self._claimed(name))
-                robot = self.robots[recorded] = ReplayedRobot(
-                    self._bus, KeySpace(self._plan.realm, name), f"a recording of {recorded}"
-                )
-                robot.begin(self._plan.statuses.get(recorded))
+                keys, status = KeySpace(self._plan.realm, name), self._plan.statuses.get(recorded)
+                robot = ReplayedRobot(self._bus, keys, f"a recording of {recorded}", status)
+                self.robots[recorded] = robot
                 robot.open()
                 stack.callback(robot.close)
                 watching.append(self._watch(ownership, name))
@@ -193,20 +192,20 @@ class Replay:
 
     # The player's thread
 
-    def _skip(self, message: Message) -> None:
+    def _skip(self, message: RecordedMessage) -> None:
         """Keep the last state of each key from before the selected part: who comes later knows it, too."""
         split = split_key(message.channel.topic)
         topic = topics.find(split[2]) if split is not None else None
         if topic is not None and topic.delivery is Delivery.STATE and len(self._earlier) < KEYS:
             self._earlier[message.channel.topic] = message
 
-    def _play(self, message: Message) -> None:
+    def _play(self, message: RecordedMessage) -> None:
         earlier, self._earlier = self._earlier, {}
         for state in earlier.values():
             self._play_now(state)
         self._play_now(message)
 
-    def _play_now(self, message: Message) -> None:
+    def _play_now(self, message: RecordedMessage) -> None:
         target = self._targets.get(message.channel.topic, _UNKNOWN)
         if target is _UNKNOWN:
             target = self._target(message)
@@ -217,7 +216,7 @@ class Replay:
                 return
         self.left_out += 1
 
-    def _target(self, message: Message) -> tuple[ReplayedRobot, str] | None:
+    def _target(self, message: RecordedMessage) -> tuple[ReplayedRobot, str] | None:
         topic, target = message.channel.topic, None
         split = split_key(topic)
         if split is not None and split[0] and message.channel.encoding == MSGPACK and split[1] in self.robots:
@@ -255,15 +254,15 @@ class Replay:
             shown.close()
 
     async def _listen(self, listener: Listener) -> None:
-        async def tell() -> None:
+        async def report_ready() -> None:
             await listener.ready.wait()
-            self._told(f"HQ programs connect at {listener.address}")
+            self._report(f"HQ programs connect at {listener.address}")
 
-        telling = asyncio.ensure_future(tell())
+        reporting = asyncio.ensure_future(report_ready())
         try:
             await listener.run()
         finally:
-            telling.cancel()
+            reporting.cancel()
 
 
 class AsRecorded:

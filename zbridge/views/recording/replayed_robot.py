@@ -3,7 +3,7 @@
 Theory of operation. ``status`` has the protocol ``replay``; whatever wants to move it, or asks for its lease, is
 refused with ``unsupported`` and shown on ``control``. Streams and states are published as they were, with new stamps;
 ``status`` and ``control`` are repeated once a second where the recording does not. Messages come from the player's
-thread, everything else happens on the event loop. A query for map or pose is answered with the last one played.
+thread, everything else runs on the event loop. A query for map or pose is answered with the last one played.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, FleetMessage, Query, Refusal, Status
 from zbridge.fleet.topics import Delivery, KeySpace, Topic
 from zbridge.protocol.rate_limit import RateLimit
-from zbridge.views.recording.reader import Message
-from zbridge.views.recording.stamps import with_stamp
+from zbridge.views.recording.reader import RecordedMessage
+from zbridge.views.stamps import with_stamp
 
 PROTOCOL = "replay"
 """What ``status`` shows in place of the robot's protocol."""
-BEAT_S = 1.0
+REPEAT_S = 1.0
 """Seconds after which ``status`` and ``control`` are repeated."""
 REFUSALS_HZ = 100.0
 """Commands a second that are refused with a word; those above are only counted."""
@@ -41,44 +41,48 @@ _LEASE = ("acquire/*", "takeover/*", "renew", "release", "unlatch/*", "unlatch_f
 
 
 class ReplayedRobot:
-    """Publishes what a recording says of one robot. says: the reason that ``status`` shows."""
+    """Publishes what a recording has of one robot. reason: shown by ``status``; status: shown until one is played."""
 
-    def __init__(self, bus: Bus, keys: KeySpace, says: str, clock_ns: Callable[[], int] = time.time_ns) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        keys: KeySpace,
+        reason: str,
+        status: Status | None = None,
+        clock_ns: Callable[[], int] = time.time_ns,
+    ) -> None:
         self.recorded_protocol: str | None = None
         """The robot's own protocol, as its last status said."""
         self.unplayed = 0
         """Messages that could not be read, or whose key has no place."""
         self._bus = bus
         self._keys = keys
-        self._says = says
+        self._reason = reason
         self._clock_ns = clock_ns
         self._publishers: dict[str, Publisher] = {}
         self._topics: dict[str, Topic | None] = {}
         self._last: dict[str, bytes] = {}
         """The last map and pose."""
-        self._status = Status(state="established", protocol=PROTOCOL, reason=says)
+        self._status = Status(state="established", protocol=PROTOCOL, reason=reason)
         self._control = Control(state="free")
-        self._told: dict[str, float] = {}
+        self._published_at: dict[str, float] = {}
         self._refusals = RefusalCounts()
         self._stops: deque[bytes] = deque(maxlen=STOPS)
         self._rate = RateLimit(REFUSALS_HZ)
         self._handles: list[Handle] = []
-        self._beating: asyncio.Task[None] | None = None
+        self._repeating: asyncio.Task[None] | None = None
         self._control_due: asyncio.TimerHandle | None = None
+        if status is not None:
+            self._note_status(status)
 
     def __repr__(self) -> str:
         return f"<ReplayedRobot {self._keys.robot}>"
-
-    def begin(self, status: Status | None) -> None:
-        """Show this status of the recording until it is played."""
-        if status is not None:
-            self._note_status(status)
 
     def open(self) -> None:
         """Appear on the bus, and refuse commands from now on."""
         bus, key = self._bus, self._keys.key
         self._handles = [
-            bus.subscribe(key("@cmd/**"), self._on_command, lane=self._sort),
+            bus.subscribe(key("@cmd/**"), self._on_command, lane=self._admit),
             *(bus.answer(key(f"@rpc/control/{name}"), self._on_lease) for name in _LEASE),
             bus.answer(key("@rpc/control/refused/*"), lambda query: query.answer(payloads.encode(Query()))),
             bus.answer(key(topics.RPC_MAP.path), self._on_question),
@@ -86,14 +90,14 @@ class ReplayedRobot:
         ]
         self._publish_status()
         self._publish_control()
-        self._beating = asyncio.get_running_loop().create_task(self._beat())
+        self._repeating = asyncio.get_running_loop().create_task(self._repeat())
 
     def close(self) -> None:
         """Leave the bus; idempotent."""
         if self._control_due is not None:
             self._control_due.cancel()
-        if self._beating is not None:
-            self._beating.cancel()
+        if self._repeating is not None:
+            self._repeating.cancel()
         handles, self._handles = self._handles, []
         publishers, self._publishers = self._publishers, {}
         for each in (*handles, *publishers.values()):
@@ -101,7 +105,7 @@ class ReplayedRobot:
 
     # On the player's thread
 
-    def play(self, path: str, message: Message) -> bool:
+    def play(self, path: str, message: RecordedMessage) -> bool:
         """Publish a message of the recording, whose key ends with ``path``; False: it is not published again."""
         topic = self._topic(path)
         if topic is None:
@@ -131,7 +135,7 @@ class ReplayedRobot:
     def _note_status(self, status: Status) -> None:
         if status.protocol not in (None, PROTOCOL):
             self.recorded_protocol = status.protocol
-        reason = f"{self._says}; {status.reason}" if status.reason else self._says
+        reason = f"{self._reason}; {status.reason}" if status.reason else self._reason
         self._status = msgspec.structs.replace(status, protocol=PROTOCOL, reason=reason)
 
     def _topic(self, path: str) -> Topic | None:
@@ -158,32 +162,32 @@ class ReplayedRobot:
     # On the event loop, or the player's thread
 
     def _publish_status(self) -> None:
-        self._tell(topics.STATUS, msgspec.structs.replace(self._status, stamp_ns=self._clock_ns()))
+        self._publish(topics.STATUS, msgspec.structs.replace(self._status, stamp_ns=self._clock_ns()))
 
     def _publish_control(self) -> None:
         refusals = (*self._control.refusals, *self._refusals.shown())
-        self._tell_control(self._control, refusals)
+        self._publish_control_of(self._control, refusals)
 
-    def _tell_control(self, control: Control, refusals: tuple[Refusal, ...]) -> None:
+    def _publish_control_of(self, control: Control, refusals: tuple[Refusal, ...]) -> None:
         own = {"stamp_ns": self._clock_ns(), "lease": None, "refusals": refusals, "stops": tuple(self._stops)}
-        self._tell(topics.CONTROL, msgspec.structs.replace(control, **own))
+        self._publish(topics.CONTROL, msgspec.structs.replace(control, **own))
 
-    def _tell(self, topic: Topic, message: FleetMessage) -> None:
-        self._told[topic.path] = time.monotonic()
+    def _publish(self, topic: Topic, message: FleetMessage) -> None:
+        self._published_at[topic.path] = time.monotonic()
         self._put(topic, payloads.encode(message))
 
-    async def _beat(self) -> None:
+    async def _repeat(self) -> None:
         while True:
-            await asyncio.sleep(BEAT_S / 4)
+            await asyncio.sleep(REPEAT_S / 4)
             now = time.monotonic()
-            if now - self._told[topics.STATUS.path] > BEAT_S * 1.2:
+            if now - self._published_at[topics.STATUS.path] > REPEAT_S * 1.2:
                 self._publish_status()
-            if now - self._told[topics.CONTROL.path] > BEAT_S * 1.2:
+            if now - self._published_at[topics.CONTROL.path] > REPEAT_S * 1.2:
                 self._publish_control()
 
     # On the event loop
 
-    def _sort(self, key: str, shown: bytes | None, size: int, look: Look) -> Lane | None:
+    def _admit(self, key: str, attachment: bytes | None, size: int, read_payload: Look) -> Lane | None:
         return Lane.OTHER if self._rate.take(time.monotonic()) else None
 
     def _on_command(self, sample: Sample) -> None:
@@ -200,15 +204,15 @@ class ReplayedRobot:
         path = query.key.rpartition("@rpc/")[2]
         payload = self._last.get(path)
         if payload is None:
-            query.refuse(NotReady("a recording, which has shown none yet"))
+            query.refuse(NotReady("a recording, which has attachment none yet"))
         else:
             query.answer(payload)
 
     def _refuse(self, command: str) -> None:
-        """Count a refusal, and show it soon. A refused stop is shown as such at once: a recording is at rest."""
+        """Count a refusal, and show it soon. A refused stop is shown as such at once: a recording is stopped."""
         self._refusals.add(command, _REFUSED, None, None, 1)
         if command == "stop":
-            self._tell_control(msgspec.structs.replace(self._control, state="stopped"), self._refusals.shown())
+            self._publish_control_of(msgspec.structs.replace(self._control, state="stopped"), self._refusals.shown())
         if self._control_due is None:
             self._control_due = asyncio.get_running_loop().call_later(_CONTROL_S, self._show_refusals)
 

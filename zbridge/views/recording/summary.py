@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 
 from zbridge.fleet.topics import split_key
-from zbridge.views.recording.reader import Channel, Message, Reader, open_recording
+from zbridge.views.recording.reader import RecordedChannel, RecordedMessage, RecordingReader, open_recording
 
 GAP_FACTOR = 10.0
 """A pause is a gap if it is so many times as long as the usual one of its key."""
@@ -39,7 +39,7 @@ class KeySummary(msgspec.Struct):
         span_ns = self.last_ns - self.first_ns
         return (self.count - 1) * 1e9 / span_ns if self.count > 1 and span_ns > 0 else 0.0
 
-    def note(self, message: Message) -> None:
+    def note(self, message: RecordedMessage) -> None:
         """Count a message."""
         if self.count:
             self._judge((message.log_ns - self.last_ns) / 1e9)
@@ -89,8 +89,8 @@ def robots_of(topics: Iterable[str]) -> list[str]:
 def summarize(path: Path) -> Summary:
     """Count what a file holds; raise ConfigError where it cannot be opened or is no recording at all."""
     with open_recording(path) as file:
-        reader = Reader(file)
-        keys: dict[Channel, KeySummary] = {}
+        reader = RecordingReader(file)
+        keys: dict[RecordedChannel, KeySummary] = {}
         begin_ns, end_ns, total = 2**64, 0, 0
         for message in reader.messages():
             channel = message.channel

@@ -2,7 +2,7 @@
 
 Theory of operation. Each link of the robot listens at an address. The gateway's connection is played the first
 conversation of the recording, and is closed where the robot's was; its next connection is played the next one. In the
-handshake a frame waits for what the gateway had said before it (:mod:`zbridge.views.recording.wire_tape`), at most for
+handshake a frame waits for what the gateway had sent before it (:mod:`zbridge.views.recording.wire_tape`), at most for
 :data:`ANSWER_S`; what comes later moves by that time, so that the pauses between frames stay as they were. A datagram
 goes to the port of the gateway that sent one last, else to that of its connection.
 """
@@ -18,8 +18,8 @@ from pathlib import Path
 from zbridge.errors import LinkError
 from zbridge.fleet.topics import KeySpace
 from zbridge.protocol.address import Address
-from zbridge.views.recording.reader import Reader, open_recording
-from zbridge.views.recording.wire_tape import Step, steps
+from zbridge.views.recording.reader import RecordingReader, open_recording
+from zbridge.views.recording.wire_tape import WireStep, steps
 
 log = logging.getLogger("zbridge.views.recording")
 
@@ -31,22 +31,27 @@ _READ = 65_536
 
 
 class WireLink:
-    """One link of the robot. said: called with what happens, for people."""
+    """One link of the robot. report: called with what happens, for people."""
 
     def __init__(
-        self, path: Path, keys: KeySpace, link: str, speed: float = 1.0, said: Callable[[str], object] = lambda _: None
+        self,
+        path: Path,
+        keys: KeySpace,
+        link: str,
+        speed: float = 1.0,
+        report: Callable[[str], object] = lambda _: None,
     ) -> None:
         self.link = link
         self.frames = 0
         self.unanswered = 0
-        """Conversations in which the gateway said less than in the recording."""
+        """Conversations in which the gateway sent less than in the recording."""
         self._path = path
         self._keys = keys
         self._speed = speed
-        self._said = said
+        self._report = report
         self._connections: asyncio.Queue[tuple[asyncio.StreamReader, asyncio.StreamWriter]] = asyncio.Queue()
         self._talking = False
-        self._heard = 0
+        self._received = 0
         self._news = asyncio.Event()
         self._datagrams: asyncio.DatagramTransport | None = None
         self._source: tuple[str, int] | None = None
@@ -71,7 +76,7 @@ class WireLink:
                 if self._datagrams is not None:
                     self._datagrams.close()
 
-    def heard_datagram(self, data: bytes, source: tuple[str, int]) -> None:
+    def receive_datagram(self, data: bytes, source: tuple[str, int]) -> None:
         """Take a datagram of the gateway's host."""
         if source[0] == self._peer:
             self._source = source
@@ -92,7 +97,7 @@ class WireLink:
 
     async def _play_all(self) -> None:
         with open_recording(self._path) as file:
-            reader = Reader(file)
+            reader = RecordingReader(file)
             number, conversation = 0, None
             async with contextlib.AsyncExitStack() as stack:
                 for step in steps(reader.messages(), self._keys, self.link):
@@ -104,15 +109,15 @@ class WireLink:
                     self.frames += 1
                 await asyncio.sleep(LINGER_S)
             if reader.fault is not None:
-                self._said(f"{self.link}: the recording is not whole: {reader.fault}")
+                self._report(f"{self.link}: the recording is not whole: {reader.fault}")
 
     @contextlib.asynccontextmanager
     async def _conversation(self) -> AsyncIterator[_Conversation]:
         """Wait for the gateway's connection, and hold it."""
         reader, writer = await self._connections.get()
-        self._talking, self._heard, self._source = True, 0, None
+        self._talking, self._received, self._source = True, 0, None
         self._peer = writer.get_extra_info("peername")[0]
-        self._said(f"{self.link}: the gateway connected from {self._peer}")
+        self._report(f"{self.link}: the gateway connected from {self._peer}")
         listening = asyncio.ensure_future(self._listen(reader))
         try:
             yield _Conversation(self, writer, asyncio.get_running_loop().time(), self._speed)
@@ -129,14 +134,14 @@ class WireLink:
                 self._note(len(data))
 
     def _note(self, size: int) -> None:
-        self._heard += size
+        self._received += size
         self._news.set()
 
-    async def hear(self, size: int) -> bool:
-        """Wait until the gateway has said so many bytes; False where it did not in time."""
+    async def wait_received(self, size: int) -> bool:
+        """Wait until the gateway has sent so many bytes; False where it did not in time."""
         try:
             async with asyncio.timeout(ANSWER_S):
-                while self._heard < size:
+                while self._received < size:
                     self._news.clear()
                     await self._news.wait()
         except TimeoutError:
@@ -160,13 +165,13 @@ class _Conversation:
         self._speed = speed
         self._answered = True
 
-    async def play(self, step: Step) -> None:
+    async def play(self, step: WireStep) -> None:
         """Send a frame when it is due."""
         loop = asyncio.get_running_loop()
         await asyncio.sleep(max(0.0, self._began + step.at_s / self._speed - loop.time()))
         if step.answers and self._answered:
             due = loop.time()
-            self._answered = await self._link.hear(step.heard)
+            self._answered = await self._link.wait_received(step.received)
             self._began += loop.time() - due
         if step.datagram:
             self._link.send_datagram(step.frame, self._writer)
@@ -181,7 +186,7 @@ class _Datagrams(asyncio.DatagramProtocol):
         self._link = link
 
     def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
-        self._link.heard_datagram(data, addr)
+        self._link.receive_datagram(data, addr)
 
     def error_received(self, exc: Exception) -> None:
         """Bear a port that nobody has bound."""

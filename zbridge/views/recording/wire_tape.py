@@ -18,14 +18,14 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Status
 from zbridge.fleet.topics import KeySpace
-from zbridge.views.recording.reader import Message
+from zbridge.views.recording.reader import RecordedMessage
 
 HANDSHAKE_S = 5.0
 """For so long the begin of a conversation lasts."""
 
 
-class Step(msgspec.Struct, frozen=True):
-    """A frame of the robot's. at_s: since its conversation began. heard: bytes that the gateway had sent before.
+class WireStep(msgspec.Struct, frozen=True):
+    """A frame of the robot's. at_s: since its conversation began. received: bytes that the gateway had sent before.
 
     number: of its conversation, from 1. answers: whether it must wait for what the gateway had sent before.
     """
@@ -34,7 +34,7 @@ class Step(msgspec.Struct, frozen=True):
     at_s: float
     frame: bytes
     datagram: bool
-    heard: int
+    received: int
     answers: bool
 
 
@@ -44,11 +44,11 @@ def wire_links(keys: KeySpace, topics_seen: Iterable[str]) -> list[str]:
     return sorted({topic[len(prefix) :].partition("/")[0] for topic in topics_seen if topic.startswith(prefix)})
 
 
-def steps(messages: Iterable[Message], keys: KeySpace, link: str) -> Iterator[Step]:
+def steps(messages: Iterable[RecordedMessage], keys: KeySpace, link: str) -> Iterator[WireStep]:
     """Yield what one link of the robot sent."""
     incoming, outgoing = keys.key(f"@wire/{link}/in"), keys.key(f"@wire/{link}/out")
     status = keys.key(topics.STATUS.path)
-    number, began_ns, heard, fresh, offline = 0, 0, 0, True, False
+    number, began_ns, received, fresh, offline = 0, 0, 0, True, False
     for message in messages:
         topic = message.channel.topic
         if topic == status:
@@ -57,12 +57,12 @@ def steps(messages: Iterable[Message], keys: KeySpace, link: str) -> Iterator[St
             offline = state == "offline"
         elif topic in (incoming, outgoing):
             if fresh:
-                number, began_ns, heard, fresh = number + 1, message.log_ns, 0, False
+                number, began_ns, received, fresh = number + 1, message.log_ns, 0, False
             at_s = max(0.0, (message.log_ns - began_ns) / 1e9)
             if topic == outgoing:
-                heard += len(message.data)
+                received += len(message.data)
             else:
-                yield Step(number, at_s, message.data, message.channel.datagram, heard, at_s < HANDSHAKE_S)
+                yield WireStep(number, at_s, message.data, message.channel.datagram, received, at_s < HANDSHAKE_S)
 
 
 def _state(payload: bytes, link: str) -> str | None:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from zbridge.errors import Malformed, Unsupported
 from zbridge.fleet.messages import Drive
 from zbridge.ros2 import Types
-from zbridge.views.ros2.settings import Body
+from zbridge.views.ros2.settings import RobotBody
 
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 MOST_BYTES: Mapping[str, int] = {TWIST: 64, STAMPED: 512}
@@ -23,7 +23,7 @@ _LARGEST = 1e6
 """m/s and rad/s above this are no command: most random bytes say so."""
 
 
-def read_twist(types: Types, type_name: str, payload: bytes, body: Body) -> Drive:
+def read_twist(types: Types, type_name: str, payload: bytes, body: RobotBody) -> Drive:
     """Read a Twist or TwistStamped; its stamp says nothing here: clocks of machines are never compared.
 
     Raises ProtocolError for what is none, Malformed for numbers that no command has, Unsupported for a turn on the spot
@@ -41,7 +41,7 @@ def read_twist(types: Types, type_name: str, payload: bytes, body: Body) -> Driv
     return drive_of(values[0], values[1], values[5], body)
 
 
-def drive_of(forward_mps: float, left_mps: float, turn_radps: float, body: Body) -> Drive:
+def drive_of(forward_mps: float, left_mps: float, turn_radps: float, body: RobotBody) -> Drive:
     """Scale speeds to a Drive. Above full scale all parts are scaled down alike: the curve stays. Or Unsupported."""
     forward_mps, left_mps, turn_radps = (
         0.0 if abs(value) < _STILL else value for value in (forward_mps, left_mps, turn_radps)

@@ -1,15 +1,36 @@
-"""A minimal URDF of a robot's configured size, so that RViz shows something. Sans-IO."""
+"""The names of the frames of a robot, after REP 105, and a minimal URDF of its configured size. Sans-IO."""
 
 from __future__ import annotations
 
-from zbridge.views.ros2.frames import Frames
-from zbridge.views.ros2.settings import Body
+from zbridge.ros2 import ros_name
+from zbridge.views.ros2.settings import RobotBody
+
+
+class Frames:
+    """The names of one robot's frames. prefix: the robot, as a part of a ROS name.
+
+    odom: where odometry counts from; base: the robot, on the ground; laser: the scanner.
+    """
+
+    def __init__(self, prefix: str) -> None:
+        self.prefix = prefix
+        self.map, self.odom = f"{prefix}/map", f"{prefix}/odom"
+        self.camera, self.laser = f"{prefix}/camera", f"{prefix}/laser"
+        self.base = f"{prefix}/base_link"
+
+    def __repr__(self) -> str:
+        return f"<Frames of {self.prefix}>"
+
+    def sensor(self, name: str) -> str:
+        """Name the frame of a sensor."""
+        return f"{self.prefix}/{ros_name(name)}"
+
 
 _LASER_M = 0.05
 """Radius and height of what is drawn for a scanner."""
 
 
-def urdf(robot: str, frames: Frames, body: Body) -> str:
+def urdf(robot: str, frames: Frames, body: RobotBody) -> str:
     """Write a box on the ground, and a cylinder where the scanner is. Frames have the robot's prefix."""
     laser = body.laser
     return f"""<?xml version="1.0"?>

@@ -17,7 +17,7 @@ MOST_VALUES = 32
 _UNUSABLE: Mapping[str, int] = {"established": OK, "connecting": WARN, "handshaking": WARN, "closing": WARN}
 
 
-class Entry(msgspec.Struct, frozen=True):
+class Diagnostic(msgspec.Struct, frozen=True):
     """One status. values: pairs of key and value."""
 
     level: int
@@ -26,51 +26,51 @@ class Entry(msgspec.Struct, frozen=True):
     values: Sequence[tuple[str, str]] = ()
 
 
-def entries_of(robot: str, status: Status | None, control: Control | None) -> list[Entry]:
-    """Return the entries of a robot's state, links, control and refusals, as its gateway tells them."""
+def entries_of(robot: str, status: Status | None, control: Control | None) -> list[Diagnostic]:
+    """Return the entries of a robot's state, links, control and refusals, as its gateway reports them."""
     return [_state(robot, status), _links(robot, status), _control(robot, control), _refusals(robot, control)]
 
 
-def _state(robot: str, status: Status | None) -> Entry:
+def _state(robot: str, status: Status | None) -> Diagnostic:
     name = f"{robot}: state"
     if status is None:
-        return Entry(STALE, name, "no gateway tells")
-    told = (("protocol", status.protocol), ("dialect", status.dialect), ("version", status.version))
-    values = [(key, value) for key, value in told if value]
+        return Diagnostic(STALE, name, "no gateway tells")
+    facts = (("protocol", status.protocol), ("dialect", status.dialect), ("version", status.version))
+    values = [(key, value) for key, value in facts if value]
     if status.features:
         values.append(("features", ", ".join(status.features)))
     text = status.state + (f": {status.reason}" if status.reason else "")
-    return Entry(_UNUSABLE.get(status.state, ERROR), name, cut(text), values)
+    return Diagnostic(_UNUSABLE.get(status.state, ERROR), name, cut(text), values)
 
 
-def _links(robot: str, status: Status | None) -> Entry:
+def _links(robot: str, status: Status | None) -> Diagnostic:
     links = status.links if status is not None else ()
     down = [link for link in links if link.state != "established"]
     values = [(f"{link.name} {link.peer}", cut(f"{link.state} {link.reason or ''}".strip())) for link in links]
     text = f"{len(links) - len(down)} of {len(links)} links established"
-    return Entry(WARN if down else OK if links else STALE, f"{robot}: links", text, values[:MOST_VALUES])
+    return Diagnostic(WARN if down else OK if links else STALE, f"{robot}: links", text, values[:MOST_VALUES])
 
 
-def _control(robot: str, control: Control | None) -> Entry:
+def _control(robot: str, control: Control | None) -> Diagnostic:
     name = f"{robot}: control"
     if control is None:
-        return Entry(STALE, name, "no gateway tells")
+        return Diagnostic(STALE, name, "no gateway tells")
     values = [("holder", cut(control.holder))] if control.holder else []
     values += [(f"latch {latch.id.hex()[:8]}", cut(latch.described)) for latch in control.latches]
     text = f"held by {control.holder}" if control.holder else control.state
     if control.latches:
         text = control.latches[-1].described
-    return Entry(OK if control.state in ("free", "held") else WARN, name, cut(text), values[:MOST_VALUES])
+    return Diagnostic(OK if control.state in ("free", "held") else WARN, name, cut(text), values[:MOST_VALUES])
 
 
-def _refusals(robot: str, control: Control | None) -> Entry:
+def _refusals(robot: str, control: Control | None) -> Diagnostic:
     refusals = control.refusals if control is not None else ()
     values = [
         (cut(f"{refusal.command} of {refusal.who or 'somebody'}"), cut(f"{refusal.reason} ({refusal.count})"))
         for refusal in refusals
     ]
     text = f"{sum(refusal.count for refusal in refusals)} commands refused lately"
-    return Entry(WARN if refusals else OK, f"{robot}: refusals", text, values[:MOST_VALUES])
+    return Diagnostic(WARN if refusals else OK, f"{robot}: refusals", text, values[:MOST_VALUES])
 
 
 def cut(text: str) -> str:

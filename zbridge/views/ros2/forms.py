@@ -15,7 +15,7 @@ _CDR, _NO_INTENSITIES = b"\0\1\0\0", bytes(4)
 """What a message of CDR begins with, and the number of intensities of a scan."""
 
 
-class Form:
+class MessageTemplate:
     """A message that is always the same, but for its stamp and some float64.
 
     write: a message as CDR. make: makes the message of a stamp in ns and ``count`` numbers. Where each of them stands
@@ -30,7 +30,7 @@ class Form:
         self._places = [self._place(write(make(0, *numbers))) for numbers in marked]
 
     def __repr__(self) -> str:
-        return f"<Form of {len(self._plain)} bytes, numbers at {self._places}>"
+        return f"<MessageTemplate of {len(self._plain)} bytes, numbers at {self._places}>"
 
     def fill(self, stamp_ns: int, *numbers: float) -> bytes:
         """Write the message."""
@@ -44,7 +44,7 @@ class Form:
         return next(at for at, (one, two) in enumerate(zip(self._plain, other, strict=True)) if one != two)
 
 
-class ScanForm:
+class ScanTemplate:
     """A LaserScan, whose definition is the same in all distributions. frame: of the scanner."""
 
     def __init__(self, frame: str) -> None:
@@ -54,7 +54,7 @@ class ScanForm:
         """What is before the ranges."""
 
     def __repr__(self) -> str:
-        return f"<ScanForm of {self._name[1].decode()}>"
+        return f"<ScanTemplate of {self._name[1].decode()}>"
 
     def fill(self, stamp_ns: int, numbers: tuple[float, ...], ranges: bytes) -> bytes | None:
         """Write the message; None where a number is too large for a float32.

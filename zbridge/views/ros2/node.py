@@ -11,17 +11,16 @@ from typing import Any
 
 from zbridge.bus import Bus, Handle, Sample
 from zbridge.client import Fleet
-from zbridge.errors import PayloadError
-from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Devices
+from zbridge.fleet.messages import Devices, FleetMessage
 from zbridge.fleet.topics import KeySpace, Topic, is_concrete
 from zbridge.ros2 import Kind
+from zbridge.views.live_robots import OnDemandSubscriptions, read_payload
 from zbridge.views.ros2.holder import NAME
 from zbridge.views.ros2.outlets import Outlet, RosSide
-from zbridge.views.ros2.pictures import TOPICS, RobotPictures, RosTopic
+from zbridge.views.ros2.pictures import TOPICS, RosPictures, RosTopic
 from zbridge.views.ros2.services import Services
-from zbridge.views.ros2.settings import Body
+from zbridge.views.ros2.settings import RobotBody
 from zbridge.views.ros2.teleop import Teleop
 
 NODE = "zbridge"
@@ -35,11 +34,11 @@ _FIXED = frozenset(topic.name for topic in TOPICS)
 class RobotNode:
     """Declares a robot on ROS's side. bus: the fleet's; own: our name there, if a certificate says one.
 
-    drive: whether cmd_vel is heard.
+    drive: whether cmd_vel is subscribed to.
     """
 
     def __init__(
-        self, side: RosSide, bus: Bus, keys: KeySpace, body: Body, *, drive: bool, own: str | None = None
+        self, side: RosSide, bus: Bus, keys: KeySpace, body: RobotBody, *, drive: bool, own: str | None = None
     ) -> None:
         self.robot = keys.robot
         self._side = side
@@ -47,13 +46,13 @@ class RobotNode:
         self._keys = keys
         self._lock = threading.Lock()
         """Streams come on Zenoh's threads, all else on the event loop's: of the pictures, and of who listens."""
-        self._pictures = RobotPictures(keys.robot, side.types, body, side.metrics)
+        self._pictures = RosPictures(keys.robot, side.types, body, side.metrics)
         self._malformed = side.metrics.count("ros2_malformed")
         self.node = side.node(f"/{self._pictures.frames.prefix}", NODE)
         self._outlets: dict[str, list[Outlet]] = {}
         self._listened: dict[str, set[Outlet]] = {}
         """The outlets of each topic that somebody listens to; topics without one are left out."""
-        self._subscribed: dict[str, Handle] = {}
+        self._subscribed = OnDemandSubscriptions(self._subscribe_to)
         self._paths: dict[str, tuple[str, ...]] = {}
         self._timer: asyncio.TimerHandle | None = None
         self._closed = False
@@ -76,8 +75,9 @@ class RobotNode:
         if self._timer is not None:
             self._timer.cancel()
         outlets = [outlet for of_topic in self._outlets.values() for outlet in of_topic]
-        for handle in (*self._handles, *self._subscribed.values(), *outlets):
+        for handle in (*self._handles, *outlets):
             handle.close()
+        self._subscribed.need(set())
         self._services.close()
         if self.teleop is not None:
             await self.teleop.close()
@@ -97,13 +97,13 @@ class RobotNode:
         def listened(anybody: bool) -> None:
             self._on_listened(topic.name, made[0], anybody)
 
-        made.append(Outlet(self._side, endpoint, listened, kept=topic.qos.depth if topic.kept else 0))
+        made.append(Outlet(self._side, endpoint, listened, kept=topic.qos.depth if topic.latched else 0))
         return made[0]
 
     # On demand
 
     def _on_listened(self, name: str, outlet: Outlet, anybody: bool) -> None:
-        if self._closed or outlet not in self._outlets.get(name, ()):  # it was told of before it was closed
+        if self._closed or outlet not in self._outlets.get(name, ()):  # it was message of before it was closed
             return
         with self._lock:
             listened = self._listened.setdefault(name, set())
@@ -117,26 +117,25 @@ class RobotNode:
     def _subscribe(self) -> None:
         """Subscribe on the fleet's bus to what the topics that are listened to need, and to nothing else."""
         needed = {path for name in self._listened for path in self._paths[name]}
-        for path in self._subscribed.keys() - needed:
-            self._subscribed.pop(path).close()
-        for path in needed - self._subscribed.keys():
-            topic = topics.find(path) if is_concrete(path) else None
-            handler = partial(self._take, path, topic) if topic is not None else self._take_any
-            history = topic is not None and topic.qos.keeps_last
-            key = self._keys.key(path)
-            self._subscribed[path] = self._bus.subscribe(key, handler, history=history, direct=not history)
+        self._subscribed.need(needed)
 
-    def _take_any(self, sample: Sample) -> None:
+    def _subscribe_to(self, path: str) -> Handle:
+        topic = topics.find(path) if is_concrete(path) else None
+        handler = partial(self._receive, path, topic) if topic is not None else self._receive_any
+        history = topic is not None and topic.qos.keeps_last
+        return self._bus.subscribe(self._keys.key(path), handler, history=history, direct=not history)
+
+    def _receive_any(self, sample: Sample) -> None:
         path = self._keys.path(sample.key)
         topic = topics.find(path)
         if topic is not None:
-            self._take(path, topic, sample)
+            self._receive(path, topic, sample)
 
-    def _take(self, path: str, topic: Topic, sample: Sample) -> None:
-        try:
-            message = payloads.decode(topic.message, sample.payload, arrays=topic is not topics.SCAN)
-        except PayloadError:
-            self._malformed.value += 1
+    def _receive(self, path: str, topic: Topic, sample: Sample) -> None:
+        message: FleetMessage | None = read_payload(
+            topic.message, sample.payload, self._malformed, arrays=topic is not topics.SCAN
+        )
+        if message is None:
             return
         with self._lock:
             listened = self._listened
@@ -150,21 +149,17 @@ class RobotNode:
             outlet.put(message)
 
     def _on_devices(self, sample: Sample) -> None:
-        try:
-            devices = payloads.decode(Devices, sample.payload)
-        except PayloadError:
-            self._malformed.value += 1
-            return
-        if self._closed:
+        devices = read_payload(Devices, sample.payload, self._malformed)
+        if devices is None or self._closed:
             return
         with self._lock:
             sensors = self._pictures.sensors(devices.devices)
         self._drop_sensors({topic.name for topic in sensors})
         self._declare(sensors)
 
-    def _drop_sensors(self, kept: set[str]) -> None:
+    def _drop_sensors(self, present: set[str]) -> None:
         """Take back the topics of sensors that the robot has no more."""
-        for name in self._outlets.keys() - kept - _FIXED:
+        for name in self._outlets.keys() - present - _FIXED:
             for outlet in self._outlets.pop(name):
                 outlet.close()
             with self._lock:
@@ -181,8 +176,8 @@ class RobotNode:
         if outlets:
             more = [self.teleop.diagnostics()] if self.teleop is not None else []
             with self._lock:
-                told = self._pictures.diagnostics(more, time.time_ns())
-            self._publish(told, outlets)
+                message = self._pictures.diagnostics(more, time.time_ns())
+            self._publish(message, outlets)
             self._timer = asyncio.get_running_loop().call_later(DIAGNOSED_S, self._diagnose)
 
     def _on_stop(self) -> None:

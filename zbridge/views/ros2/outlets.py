@@ -10,7 +10,7 @@ from typing import Any
 from zbridge.bus import Bus, Handle
 from zbridge.errors import EncodeError
 from zbridge.metrics import Metrics
-from zbridge.ros2 import Attachment, Endpoint, Kind, Node, QoS, Reliability, Types
+from zbridge.ros2 import Attachment, Endpoint, Kind, Node, Reliability, RosQoS, Types
 
 
 class RosSide:
@@ -32,7 +32,7 @@ class RosSide:
         """Name a node of this session."""
         return Node(self.domain, self.bus.zid, next(self._numbers), namespace, name)
 
-    def endpoint(self, node: Node, kind: Kind, name: str, type_name: str, qos: QoS) -> Endpoint:
+    def endpoint(self, node: Node, kind: Kind, name: str, type_name: str, qos: RosQoS) -> Endpoint:
         """Name an endpoint of a node. name: ``/r1/scan``."""
         return Endpoint(node, next(self._numbers), kind, name, type_name, self.types.hash(type_name), qos)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Container, Iterator
 from typing import Any
 
@@ -23,19 +24,56 @@ from zbridge.fleet.messages import (
     Status,
 )
 from zbridge.metrics import Metrics
-from zbridge.ros2 import KEEP_LAST_10, LATCHED, SENSOR_DATA, QoS, Types, ros_name
-from zbridge.views.ros2.description import urdf
-from zbridge.views.ros2.diagnostics import Entry, entries_of
-from zbridge.views.ros2.frames import Frames
-from zbridge.views.ros2.reckoning import Reckoning
-from zbridge.views.ros2.settings import Body
-from zbridge.views.ros2.shapes import Shapes, speeds_of
-from zbridge.views.ros2.stamps import Stamps
+from zbridge.ros2 import KEEP_LAST_10, LATCHED, SENSOR_DATA, RosQoS, Types, ros_name
+from zbridge.views.ros2.description import Frames, urdf
+from zbridge.views.ros2.diagnostics import Diagnostic, entries_of
+from zbridge.views.ros2.settings import RobotBody
+from zbridge.views.ros2.shapes import Shapes, Speeds, speeds_of
+from zbridge.views.stamps import measured_ns
+
+LONGEST_S = 3.0
+"""Nothing is added up over a longer pause: nobody knows what happened."""
+SPREAD_PER_M = 4.0
+"""The variance of the result grows by so many times that of a pose with each metre or radian."""
+
+
+class Reckoning:
+    """Adds up from the first motion on. spread: how many times larger the variance is than that of a pose."""
+
+    def __init__(self) -> None:
+        self.pose = Pose(0.0, 0.0, 0.0)
+        self.spread = 1.0
+        self._at_ns: int | None = None
+
+    def __repr__(self) -> str:
+        return f"<Reckoning {self.pose.x:.2f} {self.pose.y:.2f} {self.pose.heading:.2f}>"
+
+    def add(self, speeds: Speeds, stamp_ns: int) -> Pose | None:
+        """Add a motion that was measured at ``stamp_ns``; None where it has no speed or no turn rate."""
+        if speeds.forward_mps is None or speeds.turn_radps is None:
+            return None
+        before, self._at_ns = self._at_ns, stamp_ns
+        passed_s = (stamp_ns - before) / 1e9 if before is not None else 0.0
+        if 0.0 < passed_s <= LONGEST_S:
+            way, turned = speeds.forward_mps * passed_s, speeds.turn_radps * passed_s
+            middle = self.pose.heading + turned / 2
+            self.pose = Pose(
+                self.pose.x + way * math.cos(middle),
+                self.pose.y + way * math.sin(middle),
+                math.remainder(self.pose.heading + turned, math.tau),
+            )
+            self.spread = min(self.spread + SPREAD_PER_M * (abs(way) + abs(turned)), 1e6)
+        return self.pose
+
 
 SENSORS = "sensor/*"
 """The readings of all sensors, as a path below a robot."""
 MOST_SENSORS = 64
 """Sensors of one robot that have a topic."""
+AHEAD_NS = 1_000_000_000
+"""A stamp may be so far ahead of our clock: clocks of machines differ. A later one becomes now, counted."""
+_END_NS = (2**31 - 1) * 1_000_000_000
+"""From here on ROS has no number for a second."""
 _LONGEST_PERIOD_S = 10.0
 _KINDS = {"distance": "range", "rotational": "joint", "linear": "joint"}
 
@@ -48,12 +86,12 @@ class RosTopic(msgspec.Struct, frozen=True):
 
     name: str
     type_name: str
-    qos: QoS = KEEP_LAST_10
+    qos: RosQoS = KEEP_LAST_10
     paths: tuple[str, ...] = ()
     everywhere: bool = False
 
     @property
-    def kept(self) -> bool:
+    def latched(self) -> bool:
         """Whether who comes late gets the last message."""
         return self.qos == LATCHED
 
@@ -66,7 +104,7 @@ TOPICS = (
     RosTopic("battery_state", "sensor_msgs/msg/BatteryState", KEEP_LAST_10, (topics.BATTERY.path,)),
     RosTopic("image/compressed", "sensor_msgs/msg/CompressedImage", SENSOR_DATA, (topics.IMAGE.path,)),
     RosTopic("map", "nav_msgs/msg/OccupancyGrid", LATCHED, (topics.MAP.path,)),
-    RosTopic("tf", "tf2_msgs/msg/TFMessage", QoS(depth=100), (topics.POSE.path, topics.MOTION.path), True),
+    RosTopic("tf", "tf2_msgs/msg/TFMessage", RosQoS(depth=100), (topics.POSE.path, topics.MOTION.path), True),
     RosTopic("tf_static", "tf2_msgs/msg/TFMessage", LATCHED, (), True),
     RosTopic(
         "diagnostics",
@@ -84,16 +122,16 @@ Made = Iterator[tuple[str, Any]]
 """Names of topics and the ROS messages for them."""
 
 
-class RobotPictures:
+class RosPictures:
     """Makes the ROS messages of one robot: all of a topic that somebody listens to."""
 
-    def __init__(self, robot: str, types: Types, body: Body, metrics: Metrics) -> None:
+    def __init__(self, robot: str, types: Types, body: RobotBody, metrics: Metrics) -> None:
         self.robot = robot
         self.frames = Frames(ros_name(robot))
         self._types = types
         self._body = body
         self._shapes = Shapes(types, self.frames)
-        self._stamps = Stamps(metrics)
+        self._clamped = metrics.count("ros2_stamps_clamped")
         self._unusable = metrics.count("ros2_unusable")
         self._motion: Motion | None = None
         self._has_pose = False
@@ -106,7 +144,7 @@ class RobotPictures:
         self._names: dict[str, str] = {}
 
     def __repr__(self) -> str:
-        return f"<RobotPictures {self.robot}>"
+        return f"<RosPictures {self.robot}>"
 
     def sensors(self, devices: tuple[Device, ...]) -> list[RosTopic]:
         """Return the topics of a robot's sensors; names that are one in ROS have one topic."""
@@ -139,14 +177,15 @@ class RobotPictures:
         maker = _MAKERS.get(type(message))
         if maker is None:
             return
-        stamp_ns = self._stamps.read(message.stamp_ns, now_ns)
+        stamp_ns = measured_ns(message.stamp_ns, now_ns, min(now_ns + AHEAD_NS, _END_NS))
+        self._clamped.value += isinstance(message.stamp_ns, int) and message.stamp_ns != stamp_ns
         for name, made in maker(self, path, message, stamp_ns, wanted):
             if made is not None:
                 yield name, made
             else:
                 self._unusable.value += 1
 
-    def diagnostics(self, more: list[Entry], now_ns: int) -> Any:
+    def diagnostics(self, more: list[Diagnostic], now_ns: int) -> Any:
         """Make a DiagnosticArray of what is known, and of ``more``."""
         make = self._types.message
         entries = [*entries_of(self.robot, self._status, self._control), *more]
@@ -173,10 +212,6 @@ class RobotPictures:
         if "scan" in wanted:
             yield "scan", self._shapes.laser_scan(scan, self._scanner, stamp_ns, period_s)
 
-    def _on_scanner(self, path: str, scanner: Scanner, stamp_ns: int, wanted: Container[str]) -> Made:
-        self._scanner = scanner
-        yield from ()
-
     def _on_pose(self, path: str, pose: Pose, stamp_ns: int, wanted: Container[str]) -> Made:
         self._has_pose = True
         if "pose" in wanted:
@@ -198,18 +233,6 @@ class RobotPictures:
         if "tf" in wanted and pose is not None:
             yield "tf", self._shapes.moved(pose, stamp_ns)
 
-    def _on_map(self, path: str, fleet_map: Map, stamp_ns: int, wanted: Container[str]) -> Made:
-        if "map" in wanted:
-            yield "map", self._shapes.occupancy_grid(fleet_map, stamp_ns)
-
-    def _on_battery(self, path: str, battery: Battery, stamp_ns: int, wanted: Container[str]) -> Made:
-        if "battery_state" in wanted:
-            yield "battery_state", self._shapes.battery_state(battery, stamp_ns)
-
-    def _on_image(self, path: str, image: Image, stamp_ns: int, wanted: Container[str]) -> Made:
-        if "image/compressed" in wanted:
-            yield "image/compressed", self._shapes.compressed_image(image, stamp_ns)
-
     def _on_reading(self, path: str, reading: Reading, stamp_ns: int, wanted: Container[str]) -> Made:
         name = self._names.get(topics.unescape(path.rpartition("/")[2]))
         kind = _KINDS.get(reading.kind or "")
@@ -224,24 +247,38 @@ class RobotPictures:
             self._positions[name] = reading.value
             yield JOINTS.name, self._shapes.joint_states(self._positions, stamp_ns)
 
-    def _on_status(self, path: str, status: Status, stamp_ns: int, wanted: Container[str]) -> Made:
-        self._status = status
-        yield from ()
+    def _on_state(self, path: str, state: Scanner | Status | Control, stamp_ns: int, wanted: Container[str]) -> Made:
+        if isinstance(state, Scanner):
+            self._scanner = state
+        elif isinstance(state, Status):
+            self._status = state
+        else:
+            self._control = state
+        return iter(())
 
-    def _on_control(self, path: str, control: Control, stamp_ns: int, wanted: Container[str]) -> Made:
-        self._control = control
-        yield from ()
+
+_Maker = Callable[[RosPictures, str, Any, int, Container[str]], Made]
 
 
-_MAKERS: dict[type[FleetMessage], Callable[[RobotPictures, str, Any, int, Container[str]], Made]] = {
-    Scan: RobotPictures._on_scan,
-    Scanner: RobotPictures._on_scanner,
-    Pose: RobotPictures._on_pose,
-    Motion: RobotPictures._on_motion,
-    Map: RobotPictures._on_map,
-    Battery: RobotPictures._on_battery,
-    Image: RobotPictures._on_image,
-    Reading: RobotPictures._on_reading,
-    Status: RobotPictures._on_status,
-    Control: RobotPictures._on_control,
+def _single(name: str, shape: Callable[[Shapes, Any, int], Any]) -> _Maker:
+    """Make the one ROS message of a fleet message."""
+
+    def make(pictures: RosPictures, path: str, message: Any, stamp_ns: int, wanted: Container[str]) -> Made:
+        if name in wanted:
+            yield name, shape(pictures._shapes, message, stamp_ns)
+
+    return make
+
+
+_MAKERS: dict[type[FleetMessage], _Maker] = {
+    Scan: RosPictures._on_scan,
+    Scanner: RosPictures._on_state,
+    Pose: RosPictures._on_pose,
+    Motion: RosPictures._on_motion,
+    Map: _single("map", Shapes.occupancy_grid),
+    Battery: _single("battery_state", Shapes.battery_state),
+    Image: _single("image/compressed", Shapes.compressed_image),
+    Reading: RosPictures._on_reading,
+    Status: RosPictures._on_state,
+    Control: RosPictures._on_state,
 }

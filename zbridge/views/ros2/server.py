@@ -10,47 +10,41 @@ from collections.abc import Callable
 from zbridge.bus import Bus, BusSettings, open_bus
 from zbridge.bus.tls.member import own_name
 from zbridge.errors import BusError, ConfigError
-from zbridge.fleet.topics import KeySpace, is_name, split_key
+from zbridge.fleet.topics import KeySpace
 from zbridge.metrics import Metrics
 from zbridge.ros2 import ros_name, types_of
+from zbridge.views.live_robots import ROBOTS, watch_robots
 from zbridge.views.ros2.node import RobotNode
 from zbridge.views.ros2.outlets import RosSide
-from zbridge.views.ros2.settings import Plan
+from zbridge.views.ros2.settings import Ros2Plan
 
 log = logging.getLogger("zbridge.ros2")
 
-ROBOTS = 256
-"""Most robots that are shown at a time."""
 HIDDEN_AFTER_S = 2.0
 """A robot whose gateway is away for less keeps its node."""
 
 
-async def serve(plan: Plan, bus: BusSettings, metrics: Metrics, on_ready: Callable[[View], None]) -> None:
+async def serve(plan: Ros2Plan, bus: BusSettings, metrics: Metrics, on_ready: Callable[[View], None]) -> None:
     """Show robots until cancelled; raise BusError or ConfigError. on_ready: called when robots are looked for."""
     types = types_of(plan.distro)
-    fleet = await open_bus(bus, metrics, wait_for_peers=True, realm=plan.realm, threads=False)
-    try:
+    async with contextlib.AsyncExitStack() as stack:
+        fleet = await open_bus(bus, metrics, wait_for_peers=True, realm=plan.realm, threads=False)
+        stack.push_async_callback(fleet.close)
         try:
             ros = await open_bus(plan.ros, metrics, timestamps=True, threads=False)
         except BusError as error:
             where = ", ".join(plan.ros.connect)
             raise BusError(f"{error}: no ROS router at {where}: `ros2 run rmw_zenoh_cpp rmw_zenohd`") from error
-        try:
-            _apart(fleet, ros, plan)
-            view = View(plan, fleet, RosSide(ros, plan.domain, types, metrics), own_name(bus.tls))
-            try:
-                view.start()
-                on_ready(view)
-                await asyncio.Event().wait()
-            finally:
-                await view.close()
-        finally:
-            await ros.close()
-    finally:
-        await fleet.close()
+        stack.push_async_callback(ros.close)
+        _apart(fleet, ros, plan)
+        view = View(plan, fleet, RosSide(ros, plan.domain, types, metrics), own_name(bus.tls))
+        stack.push_async_callback(view.close)
+        view.start()
+        on_ready(view)
+        await asyncio.Event().wait()
 
 
-def _apart(fleet: Bus, ros: Bus, plan: Plan) -> None:
+def _apart(fleet: Bus, ros: Bus, plan: Ros2Plan) -> None:
     """Raise ConfigError where both sessions are at one router: a fleet's rules do not know ROS's keys."""
     if set(fleet.routers()) & set(ros.routers()) or fleet.zid in ros.routers():
         where = ", ".join(plan.ros.connect)
@@ -63,7 +57,7 @@ def _apart(fleet: Bus, ros: Bus, plan: Plan) -> None:
 class View:
     """The robots of a realm as nodes. own: our name on the fleet's bus, if a certificate says one."""
 
-    def __init__(self, plan: Plan, fleet: Bus, side: RosSide, own: str | None) -> None:
+    def __init__(self, plan: Ros2Plan, fleet: Bus, side: RosSide, own: str | None) -> None:
         self._own = own
         self._plan = plan
         self._fleet = fleet
@@ -78,7 +72,7 @@ class View:
 
     def start(self) -> None:
         """Begin to look for robots."""
-        self._fleet.watch_alive(f"{self._plan.realm}/*/@alive/gateway", self._on_gateway)
+        watch_robots(self._fleet, self._plan.realm, self._plan.robots, self._on_gateway)
         self._side.bus.watch_connected(self._on_connected)
 
     async def close(self) -> None:
@@ -95,10 +89,7 @@ class View:
             if node.teleop is not None:
                 node.teleop.connected(up)
 
-    def _on_gateway(self, key: str, alive: bool) -> None:
-        split = split_key(key)
-        if split is None or not is_name(robot := split[1]) or (self._plan.robots and robot not in self._plan.robots):
-            return
+    def _on_gateway(self, robot: str, alive: bool) -> None:
         timer = self._leaving.pop(robot, None)
         if timer is not None:
             timer.cancel()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable
 from functools import partial
 from typing import Any
 
@@ -39,7 +39,8 @@ class Services:
         self._serve(node, "latch", TRIGGER, self._latch)
         if drive:
             self._serve(node, "unlatch", TRIGGER, self._unlatch)
-            for name, switch in self._switches().items():
+            switches = {"set_light": robot.set_light, "set_lidar": robot.set_lidar, "set_camera": robot.set_camera}
+            for name, switch in switches.items():
                 self._serve(node, name, SET_BOOL, partial(_switched, switch))
 
     def __repr__(self) -> str:
@@ -48,12 +49,10 @@ class Services:
     def close(self) -> None:
         """Take the services back; idempotent. Calls that are on their way end unanswered."""
         handles, self._handles = self._handles, []
-        for closed in (*handles, *(_Cancelled(task) for task in self._tasks)):
-            closed.close()
-
-    def _switches(self) -> Mapping[str, Callable[[bool], Awaitable[None]]]:
-        robot = self._robot
-        return {"set_light": robot.set_light, "set_lidar": robot.set_lidar, "set_camera": robot.set_camera}
+        for handle in handles:
+            handle.close()
+        for task in self._tasks:
+            task.cancel()
 
     def _serve(self, node: Node, name: str, type_name: str, work: Work) -> None:
         endpoint = self._side.endpoint(node, Kind.SERVER, f"{node.namespace}/{name}", type_name, SERVICES)
@@ -111,16 +110,6 @@ class Services:
 
     async def _unlatch(self, request: Any) -> None:
         await self._robot.unlatch()
-
-
-class _Cancelled:
-    """A call that ends when the services do."""
-
-    def __init__(self, task: asyncio.Task[None]) -> None:
-        self._task = task
-
-    def close(self) -> None:
-        self._task.cancel()
 
 
 async def _switched(switch: Callable[[bool], Awaitable[None]], request: Any) -> None:

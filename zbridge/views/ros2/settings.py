@@ -1,10 +1,10 @@
-"""What ``zbridge ros2`` is told on its command line and in its file, checked as a whole before anything starts."""
+"""The settings of ``zbridge ros2``, checked as a whole before anything starts."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Annotated, TypeVar
+from collections.abc import Mapping
+from typing import Annotated
 
 import msgspec
 
@@ -12,8 +12,6 @@ from zbridge.bus import BusSettings
 from zbridge.errors import ConfigError
 from zbridge.fleet.topics import is_name
 from zbridge.ros2 import DISTROS
-
-T = TypeVar("T")
 
 ROS_ROUTER = "tcp/localhost:7447"
 """Where ``ros2 run rmw_zenoh_cpp rmw_zenohd`` listens."""
@@ -30,11 +28,11 @@ class Mount(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     yaw: Annotated[float, msgspec.Meta(ge=-math.tau, le=math.tau)] = 0.0
 
 
-class Body(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What ROS has to know of a robot, and no robot of ours tells.
+class RobotBody(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What ROS has to know of a robot, and robots do not report.
 
     speed_full_mps, turn_full_radps: its speeds at full scale. wheelbase_m: of a robot that steers, between its axles;
-    None: it turns on the spot. steer_full_rad: how far its wheels turn at full lock; an ALF vehicle is told 90 degrees
+    None: it turns on the spot. steer_full_rad: how far its wheels turn at full lock; an ALF vehicle gets 90 degrees
     then. length_m, width_m, height_m: what RViz shows. sensors: where those of these names are, and the ``camera``; of
     others no frame is told. map_to_odom: tell ROS that odometry begins at the map's origin; false where a program of
     ROS's, as slam_toolbox, tells it.
@@ -52,32 +50,21 @@ class Body(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     map_to_odom: bool = True
 
 
-class File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The file, TOML. others: of robots that have no table of their own below ``robot``."""
+class Ros2Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The file, TOML; options win over it. others: of robots that have no table of their own below ``robot``."""
 
-    domain: int | None = None
-    distro: str | None = None
-    ros: tuple[str, ...] | None = None
-    robots: tuple[str, ...] | None = None
-    drive: bool | None = None
-    realm: str | None = None
-    bus: BusSettings | None = None
-    others: Body = Body()
-    robot: dict[str, Body] = {}
-
-
-class Options(msgspec.Struct, frozen=True):
-    """The options as they are given; None and empty: not given, the file's or the default."""
-
-    domain: int | None = None
-    distro: str | None = None
-    ros: Sequence[str] = ()
-    robots: Sequence[str] = ()
+    domain: int = 0
+    distro: str = "jazzy"
+    ros: tuple[str, ...] = ()
+    robots: tuple[str, ...] = ()
     drive: bool = False
-    realm: str | None = None
+    realm: str = "fleet"
+    bus: BusSettings | None = None
+    others: RobotBody = RobotBody()
+    robot: dict[str, RobotBody] = {}
 
 
-class Plan(msgspec.Struct, frozen=True):
+class Ros2Plan(msgspec.Struct, frozen=True):
     """What the view starts from. robots: those that are shown, empty for all."""
 
     domain: int
@@ -86,44 +73,36 @@ class Plan(msgspec.Struct, frozen=True):
     realm: str
     robots: frozenset[str]
     drive: bool
-    others: Body
-    bodies: Mapping[str, Body]
+    others: RobotBody
+    bodies: Mapping[str, RobotBody]
 
-    def body(self, robot: str) -> Body:
+    def body(self, robot: str) -> RobotBody:
         """Return what is known of a robot."""
         return self.bodies.get(robot, self.others)
 
 
-def plan(options: Options, file: File) -> Plan:
-    """Check the options and the file together; raise ConfigError, which names what is wrong."""
-    domain = _first(options.domain, file.domain, 0)
-    if not 0 <= domain <= 232:  # as DDS has it
-        raise ConfigError(f"domain = {domain}: expected 0 to 232")
-    distro = _first(options.distro, file.distro, "jazzy")
-    if distro not in DISTROS:
-        raise ConfigError(f"distro = {distro!r}: expected one of {', '.join(DISTROS)}")
-    robots = frozenset(options.robots or file.robots or ())
-    for name in sorted(robots | file.robot.keys()):
+def plan(settings: Ros2Settings) -> Ros2Plan:
+    """Check the settings; raise ConfigError, which names what is wrong."""
+    if not 0 <= settings.domain <= 232:  # as DDS has it
+        raise ConfigError(f"domain = {settings.domain}: expected 0 to 232")
+    if settings.distro not in DISTROS:
+        raise ConfigError(f"distro = {settings.distro!r}: expected one of {', '.join(DISTROS)}")
+    robots = frozenset(settings.robots)
+    for name in sorted(robots | settings.robot.keys()):
         if not is_name(name):
             raise ConfigError(f"robot {name!r}: expected letters, digits, '_', '.' and '-' only")
-    connect = tuple(options.ros or file.ros or (ROS_ROUTER,))
+    connect = settings.ros or (ROS_ROUTER,)
     try:
         ros = msgspec.convert({"mode": "client", "connect": connect, "multicast": False}, BusSettings)
     except msgspec.ValidationError as error:
         raise ConfigError(f"ros = {list(connect)}: expected Zenoh endpoints like {ROS_ROUTER!r}") from error
-    return Plan(
-        domain=domain,
-        distro=distro,
+    return Ros2Plan(
+        domain=settings.domain,
+        distro=settings.distro,
         ros=ros,
-        realm=_first(options.realm, file.realm, "fleet"),
+        realm=settings.realm,
         robots=robots,
-        drive=options.drive or bool(file.drive),
-        others=file.others,
-        bodies=file.robot,
+        drive=settings.drive,
+        others=settings.others,
+        bodies=settings.robot,
     )
-
-
-def _first(given: T | None, written: T | None, default: T) -> T:
-    if given is not None:
-        return given
-    return written if written is not None else default

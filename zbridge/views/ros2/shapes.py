@@ -16,8 +16,8 @@ import numpy as np
 
 from zbridge.fleet.messages import Battery, Image, Map, Motion, Pose, Reading, Scan, Scanner
 from zbridge.ros2 import Types
-from zbridge.views.ros2.forms import Form, ScanForm
-from zbridge.views.ros2.frames import Frames
+from zbridge.views.ros2.description import Frames
+from zbridge.views.ros2.forms import MessageTemplate, ScanTemplate
 
 POSITION_VARIANCE = 0.05**2
 """Of x and y of a pose, m2. No robot of ours tells how good its pose is: an estimate."""
@@ -30,7 +30,7 @@ TURN_VARIANCE = 0.05**2
 UNMEASURED = 1e6
 """The variance of what nobody measured."""
 _NO_ESTIMATE = -1.0
-"""In the first place of an Imu's covariance: this part is not given."""
+"""In the first place of an Imu's covariance: this part is not known."""
 _ORIGIN, _NOTHING = Pose(0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 _SECOND_NS = 1_000_000_000
 _CELLS = np.array([-1, 0, 100] + [-1] * 253, np.int8)
@@ -66,7 +66,7 @@ class Shapes:
         self._make = types.message
         self._write = types.encode
         self.frames = frames
-        self._scan = ScanForm(frames.laser)
+        self._scan = ScanTemplate(frames.laser)
 
     def __repr__(self) -> str:
         return f"<Shapes of {self.frames.prefix}>"
@@ -99,12 +99,12 @@ class Shapes:
         return self._pose_form.fill(stamp_ns, *_place(pose)) if _is_finite(pose) else None
 
     @cached_property
-    def _pose_form(self) -> Form:
+    def _pose_form(self) -> MessageTemplate:
         def make(stamp_ns: int, *place: float) -> Any:
             header = self.header(stamp_ns, self.frames.map)
             return self._make("geometry_msgs/msg/PoseStamped", header=header, pose=self._pose(*place))
 
-        return Form(self._write, make, 4)
+        return MessageTemplate(self._write, make, 4)
 
     def odometry(self, pose: Pose | None, speeds: Speeds, stamp_ns: int, spread: float = 1.0) -> bytes | None:
         """Write an Odometry. pose: in the frame odom, None: unknown; spread: its variances are so many times larger."""
@@ -120,7 +120,7 @@ class Shapes:
         return self._odometry_form.fill(stamp_ns, *place, position, position, heading, *speed, forward, turn)
 
     @cached_property
-    def _odometry_form(self) -> Form:
+    def _odometry_form(self) -> MessageTemplate:
         def make(stamp_ns: int, *numbers: float) -> Any:
             place, (x, y, heading, forward, turn), speeds = numbers[:4], numbers[4:9], numbers[9:]
             return self._make(
@@ -141,7 +141,7 @@ class Shapes:
                 ),
             )
 
-        return Form(self._write, make, 11)
+        return MessageTemplate(self._write, make, 11)
 
     def occupancy_grid(self, fleet_map: Map, stamp_ns: int) -> Any | None:
         """Make an OccupancyGrid: -1 unknown, 0 free, 100 occupied; rows along y."""
@@ -169,11 +169,11 @@ class Shapes:
         gyro, acceleration = motion.gyro, motion.acceleration
         if gyro is None and acceleration is None:
             return None
-        given = tuple(0.0 if vector is not None else _NO_ESTIMATE for vector in (gyro, acceleration))
-        return self._imu_form.fill(stamp_ns, *(gyro or _NOTHING), *(acceleration or _NOTHING), *given)
+        known = tuple(0.0 if vector is not None else _NO_ESTIMATE for vector in (gyro, acceleration))
+        return self._imu_form.fill(stamp_ns, *(gyro or _NOTHING), *(acceleration or _NOTHING), *known)
 
     @cached_property
-    def _imu_form(self) -> Form:
+    def _imu_form(self) -> MessageTemplate:
         def make(stamp_ns: int, *numbers: float) -> Any:
             return self._make(
                 "sensor_msgs/msg/Imu",
@@ -186,7 +186,7 @@ class Shapes:
                 linear_acceleration_covariance=_first(numbers[7]),
             )
 
-        return Form(self._write, make, 8)
+        return MessageTemplate(self._write, make, 8)
 
     def battery_state(self, battery: Battery, stamp_ns: int) -> Any | None:
         """Make a BatteryState; NaN is what the robot does not tell."""
@@ -194,13 +194,13 @@ class Shapes:
         return self._make(
             "sensor_msgs/msg/BatteryState",
             header=self.header(stamp_ns, self.frames.base),
-            voltage=_told(battery.voltage),
+            voltage=_or_nan(battery.voltage),
             temperature=math.nan,
-            current=_told(battery.current),
+            current=_or_nan(battery.current),
             charge=math.nan,
             capacity=math.nan,
             design_capacity=math.nan,
-            percentage=_told(battery.level),
+            percentage=_or_nan(battery.level),
             power_supply_status=status,
             present=True,
         )
@@ -263,12 +263,12 @@ class Shapes:
         return self._moved_form.fill(stamp_ns, *_place(pose)) if _is_finite(pose) else None
 
     @cached_property
-    def _moved_form(self) -> Form:
+    def _moved_form(self) -> MessageTemplate:
         def make(stamp_ns: int, x: float, y: float, *turned: float) -> Any:
             moved = self._transform((self.frames.odom, self.frames.base), stamp_ns, x, y, 0.0, *turned)
             return self._make("tf2_msgs/msg/TFMessage", transforms=[moved])
 
-        return Form(self._write, make, 4)
+        return MessageTemplate(self._write, make, 4)
 
     def text(self, text: str) -> Any:
         """Make a String."""
@@ -292,7 +292,7 @@ def _between_s(count: int, scan: Scan, scanner: Scanner | None, period_s: float)
     return between_s if 0.0 < between_s * (count - 1) <= longest_s else 0.0
 
 
-def _told(value: float | None) -> float:
+def _or_nan(value: float | None) -> float:
     return math.nan if value is None else value
 
 

@@ -4,7 +4,7 @@ Theory of operation. A liveliness watch knows the publishers by their tokens, an
 Zenoh loses the news of some tokens while many come and go at once: they are asked for again, at most every
 :data:`ASK_S`, where somebody unknown commands or there is no place for another publisher.
 :meth:`Teleop._sort` runs on Zenoh's threads: it drops what no known publisher sent, and what comes faster than
-:data:`RATE_HZ`, before the event loop hears of it. The rest is read (``cmd_vel``), and carried out by ``holder``.
+:data:`RATE_HZ`, before the event loop receives it. The rest is read (``cmd_vel``), and carried out by ``holder``.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from zbridge.fleet.messages import Control, Drive
 from zbridge.protocol.rate_limit import RateLimit
 from zbridge.ros2 import KEEP_LAST_10, Endpoint, Kind, Node, endpoints_of, read_attachment, read_token
 from zbridge.views.ros2.cmd_vel import MOST_BYTES, read_twist
-from zbridge.views.ros2.diagnostics import MOST_VALUES, OK, WARN, Entry, cut
+from zbridge.views.ros2.diagnostics import MOST_VALUES, OK, WARN, Diagnostic, cut
 from zbridge.views.ros2.driving import PUBLISHERS, QUIET_S, Action, Decision, Driving, Standing
 from zbridge.views.ros2.holder import Holder
 from zbridge.views.ros2.outlets import RosSide
-from zbridge.views.ros2.settings import Body
+from zbridge.views.ros2.settings import RobotBody
 
 RATE_HZ = 200.0
 """Commands a second of one publisher that are heard."""
@@ -48,7 +48,7 @@ class Teleop:
     """
 
     def __init__(
-        self, side: RosSide, node: Node, robot: Robot, body: Body, fleet: Bus, control_key: str, name: str
+        self, side: RosSide, node: Node, robot: Robot, body: RobotBody, fleet: Bus, control_key: str, name: str
     ) -> None:
         self._side = side
         self._robot = robot
@@ -188,7 +188,7 @@ class Teleop:
                 self._on_token(token, True, late=True)
 
     def _watch_control(self, wanted: bool) -> None:
-        """Look who stops the robot, while there is a publisher."""
+        """Watch who stops the robot, while there is a publisher."""
         if wanted and self._control is None:
             self._stopped = None
             self._control = self._fleet.subscribe(self._control_key, self._on_control)
@@ -273,7 +273,7 @@ class Teleop:
 
     # What is told
 
-    def diagnostics(self) -> Entry:
+    def diagnostics(self) -> Diagnostic:
         """Return who drives, and why others may not."""
         publishers = list(self._driving.publishers.values())[:MOST_VALUES]
         values = [(cut(publisher.name), _standing(publisher.standing, publisher.why)) for publisher in publishers]
@@ -285,7 +285,7 @@ class Teleop:
         if owing:
             text += f"; {owing[0].name} is refused: {_standing(Standing.OWES, owing[0].why)}"
         level = WARN if owing or self._wrong else OK
-        return Entry(level, f"{self._robot.name}: cmd_vel", cut(text), values[:MOST_VALUES])
+        return Diagnostic(level, f"{self._robot.name}: cmd_vel", cut(text), values[:MOST_VALUES])
 
 
 def _standing(standing: Standing, why: str) -> str:

@@ -18,12 +18,19 @@ from zbridge.client import bus_settings
 
 app = typer.Typer()
 
+Recorded = Annotated[
+    Path | None, typer.Argument(help="a recording (MCAP) to play, instead of live robots", show_default=False)
+]
+FullSpeeds = Annotated[list[str], typer.Option(help="m/s at full scale, NUMBER or ROBOT=NUMBER; 1 by default")]
+FullTurns = Annotated[list[str], typer.Option(help="rad/s at full scale, NUMBER or ROBOT=NUMBER; 1 by default")]
+DriverName = Annotated[
+    str, typer.Option(help="what drivers are called first: the name of the certificate, else foxglove")
+]
+
 
 @app.command()
 def foxglove(
-    file: Annotated[
-        Path | None, typer.Argument(help="a recording (MCAP) to play, instead of live robots", show_default=False)
-    ] = None,
+    file: Recorded = None,
     listen: Annotated[str, typer.Option(help="host:port for Foxglove; port 0: any free one")] = "127.0.0.1:8765",
     robot: Annotated[list[str], typer.Option(help="show this robot only; once for each; all by default")] = [],
     drive: Annotated[bool, typer.Option("--drive", help="let viewers with the token or a listed Origin drive")] = False,
@@ -33,15 +40,9 @@ def foxglove(
     tls_certificate: Annotated[Path | None, typer.Option(help="certificate (PEM), for wss://")] = None,
     tls_key: Annotated[Path | None, typer.Option(help="its key (PEM)")] = None,
     insecure: Annotated[bool, typer.Option("--insecure", help="serve other machines without TLS")] = False,
-    speed_full_mps: Annotated[
-        list[str], typer.Option(help="m/s at full scale, NUMBER or ROBOT=NUMBER; 1 by default")
-    ] = [],
-    turn_full_radps: Annotated[
-        list[str], typer.Option(help="rad/s at full scale, NUMBER or ROBOT=NUMBER; 1 by default")
-    ] = [],
-    who: Annotated[
-        str, typer.Option(help="what drivers are called first: the name of the certificate, else foxglove")
-    ] = "",
+    speed_full_mps: FullSpeeds = [],
+    turn_full_radps: FullTurns = [],
+    who: DriverName = "",
     viewers: Annotated[int, typer.Option(help="most viewers at a time", min=1, max=1000)] = 32,
     metrics: Annotated[str, typer.Option(help="host:port at which Prometheus reads the counters")] = "",
     connect: Connect = [],
@@ -50,7 +51,7 @@ def foxglove(
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="log what is refused")] = False,
 ) -> None:
     """Serve robots live, or a recording, to Foxglove until SIGTERM or SIGINT."""
-    from zbridge.cli.foxglove import run_foxglove
+    from zbridge.cli.viewers import run_foxglove
 
     set_up_log(verbose=verbose)
     given: dict[str, object] = {
@@ -97,7 +98,7 @@ def health(
     json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
 ) -> None:
     """Print how the robots are, for monitoring: exit code 0 ok, 1 warning, 2 critical."""
-    from zbridge.cli.health import report_health
+    from zbridge.cli.bus import report_health
 
     set_up_log(verbose=False, level=logging.CRITICAL)
     if robot:
@@ -126,8 +127,9 @@ def echo(
     from zbridge.cli import bus
 
     set_up_log(verbose=False, level=logging.ERROR)
-    options = bus.EchoOptions(key=key, realm=realm or None, as_json=json, count=count, seconds=seconds)
-    if run_loop(until_signal(bus.echo(bus_settings(connect, tls), options))) is False:
+    settings = bus_settings(connect, tls)
+    work = bus.echo(settings, key, realm=realm or None, as_json=json, count=count, seconds=seconds)
+    if run_loop(until_signal(work)) is False:
         raise typer.Exit(1)
 
 
@@ -161,7 +163,7 @@ def stop(
     realm: Realm = "fleet",
 ) -> None:
     """Stop a robot, or all of them; open to everyone who can write the key."""
-    from zbridge.cli.stops import stop
+    from zbridge.cli.gateway_commands import stop
 
     set_up_log(verbose=False, level=logging.ERROR)
     _check_one_or_all(robot, everything=everything)
@@ -179,7 +181,7 @@ def unlatch(
     realm: Realm = "fleet",
 ) -> None:
     """Release the latched stops of a robot, or those of the whole fleet; robots move only when somebody drives."""
-    from zbridge.cli.stops import unlatch
+    from zbridge.cli.gateway_commands import unlatch
 
     set_up_log(verbose=False, level=logging.ERROR)
     _check_one_or_all(robot, everything=everything)
@@ -197,7 +199,7 @@ def restart(
     realm: Realm = "fleet",
 ) -> None:
     """Restart a robot's gateway, or all of them: robots and HQ programs stay connected; what moves is stopped."""
-    from zbridge.cli.restart import restart as ask
+    from zbridge.cli.gateway_commands import restart as ask
 
     set_up_log(verbose=False, level=logging.ERROR)
     _check_one_or_all(robot, everything=everything)
@@ -225,17 +227,18 @@ def ros2(
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="log what is refused")] = False,
 ) -> None:
     """Show robots to ROS 2 over its middleware rmw_zenoh, until SIGTERM or SIGINT; needs zbridge[ros2]."""
-    from zbridge.cli.ros2 import run_ros2
+    from zbridge.cli.viewers import run_ros2
 
     set_up_log(verbose=verbose)
-    given: dict[str, object] = {
+    options: dict[str, object] = {
         "domain": domain,
-        "robots": robot,
-        "drive": drive,
+        "robots": tuple(robot) or None,
+        "drive": drive or None,
         "distro": distro or None,
-        "ros": ros,
+        "ros": tuple(ros) or None,
         "realm": realm or None,
     }
+    given = {name: value for name, value in options.items() if value is not None}
     run_ros2(bus_settings(connect, tls) if connect or tls else None, bus_settings(), file, given)
 
 

@@ -1,10 +1,13 @@
-"""Carries out ``zbridge record, info, export, mark``."""
+"""Carries out ``zbridge record, info, export, mark, replay``."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
+import sys
 import time
+from collections.abc import Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -13,24 +16,29 @@ import msgspec
 
 import zbridge
 from zbridge.app import until_signal
+from zbridge.app.tasks import together
 from zbridge.bus import BusSettings, read_key_expr
 from zbridge.bus.tls.member import own_name, own_role
 from zbridge.cli.bus import console, errors, joined, print_columns
 from zbridge.client.driver import default_who
-from zbridge.errors import ConfigError, ZbridgeError
+from zbridge.errors import ConfigError, LinkError, ZbridgeError
 from zbridge.fleet.printable import as_json as to_json
 from zbridge.fleet.printable import shown
-from zbridge.fleet.topics import is_name
-from zbridge.views.recording import amounts, marks
-from zbridge.views.recording.configuration import describe_configuration
+from zbridge.fleet.topics import KeySpace, is_name
+from zbridge.metrics import Metrics
+from zbridge.protocol.address import Address
+from zbridge.protocol.plugin import Protocol, find_protocol
+from zbridge.views.recording.capture import BusCapture, RecordPlan, publish_mark
+from zbridge.views.recording.contents import Pictures, describe_configuration
 from zbridge.views.recording.export import export_arrays, export_tables, first_ns
-from zbridge.views.recording.files import Tape, TapeSettings
 from zbridge.views.recording.intake import Intake
-from zbridge.views.recording.pictures import Pictures
-from zbridge.views.recording.record import Recording, RecordPlan
+from zbridge.views.recording.player import Player
 from zbridge.views.recording.recorder import Recorder
-from zbridge.views.recording.selection import Selection
+from zbridge.views.recording.replay import Replay, ReplayPlan, plan_listeners, plan_names, survey
+from zbridge.views.recording.selection import read_seconds, read_selection, read_split
 from zbridge.views.recording.summary import Summary, summarize
+from zbridge.views.recording.tape import Tape, TapeSettings
+from zbridge.views.recording.wire_robot import WireLink
 
 _LOSSES = 20
 """Keys with losses that are printed."""
@@ -56,7 +64,7 @@ class RecordOptions(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def _tape_settings(options: RecordOptions) -> TapeSettings:
-    split_bytes, split_s = amounts.read_split(options.split) if options.split else (None, None)
+    split_bytes, split_s = read_split(options.split) if options.split else (None, None)
     if options.keep and not options.split:
         raise ConfigError("keep: needs --split")
     if options.compression not in ("zstd", "lz4", "none"):
@@ -88,9 +96,9 @@ async def run_record(settings: BusSettings, options: RecordOptions) -> bool:
     if not is_name(options.realm):
         raise ConfigError(f"realm = {options.realm!r}: expected letters, digits, '_', '.' and '-' only")
     keys = read_key_expr("keys", options.keys) if options.keys else None
-    duration_s = amounts.read_seconds("duration", options.duration) if options.duration else None
+    duration_s = read_seconds("duration", options.duration) if options.duration else None
     tape = Tape(_tape_settings(options))
-    buffer, _ = amounts.read_split(options.buffer)
+    buffer, _ = read_split(options.buffer)
     if buffer is None or buffer < _LEAST_BUFFER:
         raise ConfigError(f"buffer = {options.buffer!r}: expected a size of 1MiB or more")
     intake, full, loop = Intake(buffer), asyncio.Event(), asyncio.get_running_loop()
@@ -105,7 +113,7 @@ async def run_record(settings: BusSettings, options: RecordOptions) -> bool:
     plan = RecordPlan(options.realm, options.robots, keys, options.wire)
     async with joined(settings, options.realm) as bus:
         recorder.start()
-        recording = Recording(bus, plan, intake)
+        recording = BusCapture(bus, plan, intake)
         recording.open()
         errors.print(shown(f"recording {', '.join(plan.key_exprs)} to {tape.files[0]}"))
         begun = time.monotonic()
@@ -144,7 +152,7 @@ async def put_mark(settings: BusSettings, realm: str, text: str, who: str | None
     if (role := own_role(settings.tls)) in _MARKS_NOT:
         raise ConfigError(f"a {role} may not mark: expected the certificate of an operator")
     async with joined(settings, realm) as bus:
-        await marks.put(bus, realm, text, who or own_name(settings.tls) or default_who())
+        await publish_mark(bus, realm, text, who or own_name(settings.tls) or default_who())
 
 
 def show_info(path: Path, *, as_json: bool) -> None:
@@ -190,12 +198,7 @@ def _day(stamp_ns: int) -> str:
 
 def run_export(path: Path, output: Path | None, keys: str, since: str, until: str, *, arrays: bool) -> None:
     """Write a recording as tables or arrays."""
-    begin_ns = first_ns(path)
-    selection = Selection(
-        keys or None,
-        amounts.read_moment("from", since, begin_ns) if since else 0,
-        amounts.read_moment("to", until, begin_ns) if until else 2**64,
-    )
+    selection = read_selection(first_ns(path), since, until, keys or None)
     output = output or path.with_suffix(".npz" if arrays else "")
     if output == path or (arrays and output.exists()):
         raise ConfigError(f"{output} exists: give another name with -o")
@@ -208,3 +211,115 @@ def run_export(path: Path, output: Path | None, keys: str, since: str, until: st
     )
     if done.fault is not None:
         errors.print(shown(f"the recording is not whole: {done.fault}"))
+
+
+class ReplayOptions(msgspec.Struct, frozen=True, kw_only=True):
+    """The options of ``zbridge replay`` as they were written."""
+
+    path: Path
+    realm: str
+    robots: tuple[str, ...]
+    speed: float
+    loop: bool
+    since: str
+    until: str
+    pause: bool
+    hq: tuple[str, ...]
+
+
+def _plan(options: ReplayOptions) -> ReplayPlan:
+    seen, begin_ns = survey(options.path), first_ns(options.path)
+    names = plan_names(seen.robots, options.robots)
+    if options.hq and len(names) > 1:
+        raise ConfigError(f"hq: serves one robot, and the replay has {', '.join(names)}: choose one by --robot")
+    return ReplayPlan(
+        path=options.path,
+        realm=options.realm,
+        names=names,
+        selection=read_selection(begin_ns, options.since, options.until),
+        speed=options.speed,
+        loop=options.loop,
+        paused=options.pause,
+        listeners=plan_listeners(options.hq),
+        statuses=seen.statuses,
+    )
+
+
+async def run_replay(settings: BusSettings, options: ReplayOptions) -> None:
+    """Replay onto the bus until the end of the file or a signal."""
+    plan = _plan(options)
+    async with joined(settings, options.realm) as bus:
+        replay = Replay(bus, plan, lambda text: errors.print(shown(text)))
+        with _keys(replay.player) if plan.paused else contextlib.nullcontext():
+            errors.print(shown(", ".join(f"{recorded} as {name}" for recorded, name in plan.names.items())))
+            await until_signal(replay.run())
+    others = f", {replay.left_out} left out (other robots, commands, queries, raw frames, pictures)"
+    errors.print(shown(f"{replay.played} messages played{others if replay.left_out else ''}"))
+    if replay.fault is not None:
+        errors.print(shown(f"the recording is not whole: {replay.fault}"))
+
+
+@contextlib.contextmanager
+def _keys(player: Player) -> Iterator[None]:
+    """Let Enter pause and resume the player."""
+    loop, stdin = asyncio.get_running_loop(), sys.stdin.fileno()
+
+    def pressed() -> None:
+        if not os.read(stdin, 1024):
+            loop.remove_reader(stdin)
+            return
+        if player.paused:
+            player.resume()
+        else:
+            player.pause()
+        errors.print("paused: Enter goes on" if player.paused else "playing: Enter pauses")
+
+    try:
+        loop.add_reader(stdin, pressed)
+    except OSError as error:
+        raise ConfigError(f"pause: stdin cannot be read: {error.strerror}") from error
+    errors.print("paused: Enter goes on")
+    try:
+        yield
+    finally:
+        loop.remove_reader(stdin)
+
+
+async def run_wire(path: Path, protocol: str, listen: list[str], robots: list[str], speed: float, realm: str) -> None:
+    """Be the legacy robot until all was played, or a signal."""
+    try:
+        addresses = [Address.parse(text) for text in listen]
+    except LinkError as error:
+        raise ConfigError(f"listen = {error}") from error
+    found = find_protocol(protocol)
+    if len(addresses) > found.links:
+        raise ConfigError(f"listen: a {found.name} robot has at most {found.links} links")
+    seen = survey(path)
+    known = seen.robots
+    if len(robots) > 1 or (len(known) > 1 and not robots) or (robots and robots[0] not in known):
+        raise ConfigError(f"robot: the recording has {', '.join(known)}: name one by --robot")
+    keys = KeySpace(realm, robots[0] if robots else known[0])
+    names = _links(found, len(addresses), seen.links.get(keys.robot, []))
+    links = [WireLink(path, keys, name, speed, lambda text: errors.print(shown(text))) for name in names]
+    ready = [lambda at, name=link.link: print(f"{name} listens at {at}", flush=True) for link in links]  # noqa: T201
+    await until_signal(together(*(link.run(at, tell) for link, at, tell in zip(links, addresses, ready, strict=True))))
+    for link in links:
+        less = f"; in {link.unanswered} conversations the gateway said less than then" if link.unanswered else ""
+        errors.print(shown(f"{link.link}: {link.frames} frames{less}"))
+
+
+def _links(protocol: Protocol, count: int, recorded: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of the links of a robot with so many; raise ConfigError if the recording has other ones."""
+    names = {
+        number: protocol.robot(protocol.options(), number, Metrics()).link_names
+        for number in range(1, protocol.links + 1)
+    }
+    missing = set(names[count]) - set(recorded)
+    if not missing:
+        return names[count]
+    there = ", ".join(recorded) or "none: record it with --wire"
+    fitting = next((each for each in names.values() if set(each) <= set(recorded)), None)
+    if fitting is not None:
+        often = f"give {len(fitting)} --listen, in this order" if len(fitting) > 1 else "give one --listen"
+        raise ConfigError(f"listen: the recorded robot has the links {', '.join(fitting)}: {often}")
+    raise ConfigError(f"as-robot: no raw frames of link {', '.join(sorted(missing))}; the recording has {there}")

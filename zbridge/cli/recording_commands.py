@@ -1,4 +1,4 @@
-"""Declares ``zbridge record, info, export, mark, replay``; ``recorded`` and ``replayed`` carry them out."""
+"""Declares ``zbridge record, info, export, mark, replay``; ``recording`` carries them out."""
 
 from __future__ import annotations
 
@@ -17,6 +17,27 @@ app = typer.Typer()
 Recorded = Annotated[Path, typer.Argument(help="a recording (MCAP)", show_default=False)]
 Since = Annotated[str, typer.Option("--from", help="begin here: 12.5, 1:30, or a time of day: 2026-11-22T05:00:00")]
 Until = Annotated[str, typer.Option("--to", help="end here; written as --from")]
+NewNames = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="the new name; of several robots RECORDED=NEW for each. By default all, as NAME-replay; "
+        "with --as-robot: which robot of the recording"
+    ),
+]
+HqListeners = Annotated[
+    list[str] | None,
+    typer.Option(help="serve old HQ programs: PROTOCOL:PORT, PROTOCOL:HOST:PORT or a file with [[hq]]"),
+]
+AsRobot = Annotated[
+    str, typer.Option("--as-robot", help="be the legacy robot itself, from its raw frames; the protocol's name")
+]
+Listen = Annotated[
+    list[str] | None, typer.Option(help="where the legacy robot listens, tcp://host:port; once for each link")
+]
+Configurations = Annotated[
+    list[Path] | None,
+    typer.Option(help="a gateway's configuration, to be kept in the recording without its secrets"),
+]
 
 
 @app.command()
@@ -31,17 +52,14 @@ def record(
     keep: Annotated[int, typer.Option(help="keep the last N files; with --split", min=0)] = 0,
     duration: Annotated[str, typer.Option(help="end after this time: 90s, 10min, 1h")] = "",
     compression: Annotated[str, typer.Option(help="zstd, lz4 or none")] = "zstd",
-    config: Annotated[
-        list[Path] | None,
-        typer.Option(help="a gateway's configuration, to be kept in the recording without its secrets"),
-    ] = None,
+    config: Configurations = None,
     buffer: Annotated[str, typer.Option(help="how much may wait for a slow disk")] = "64MiB",
     connect: Connect = [],  # noqa: B006
     tls: TlsFolder = None,
     realm: Realm = "fleet",
 ) -> None:
     """Record robots, or all of them, until SIGTERM or SIGINT: every key, commands and refusals too."""
-    from zbridge.cli.recorded import RecordOptions, run_record
+    from zbridge.cli.recording import RecordOptions, run_record
 
     set_up_log(verbose=False, level=logging.WARNING)
     if sum(map(bool, (robots, everything, keys))) != 1:
@@ -72,7 +90,7 @@ def info(
     json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
 ) -> None:
     """Say what a recording holds: robots, keys, counts, rates, gaps, and whether it was cut off."""
-    from zbridge.cli.recorded import show_info
+    from zbridge.cli.recording import show_info
 
     show_info(file, as_json=json)
 
@@ -90,7 +108,7 @@ def export(
     until: Until = "",
 ) -> None:
     """Write a recording as tables or as numpy arrays."""
-    from zbridge.cli.recorded import run_export
+    from zbridge.cli.recording import run_export
 
     if csv == npz:
         give_up(2, "give either --csv or --npz")
@@ -106,7 +124,7 @@ def mark(
     realm: Realm = "fleet",
 ) -> None:
     """Write an event into all running recordings of the realm."""
-    from zbridge.cli.recorded import put_mark
+    from zbridge.cli.recording import put_mark
 
     set_up_log(verbose=False, level=logging.ERROR)
     run_loop(put_mark(bus_settings(connect, tls), realm, text, who or None))
@@ -115,34 +133,21 @@ def mark(
 @app.command()
 def replay(
     file: Recorded,
-    robot: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="the new name; of several robots RECORDED=NEW for each. By default all, as NAME-replay; "
-            "with --as-robot: which robot of the recording"
-        ),
-    ] = None,
+    robot: NewNames = None,
     speed: Annotated[float, typer.Option(help="seconds of the recording per second", min=0.01, max=1000.0)] = 1.0,
     loop: Annotated[bool, typer.Option("--loop", help="begin anew at the end")] = False,
     since: Since = "",
     until: Until = "",
     pause: Annotated[bool, typer.Option("--pause", help="wait; Enter goes on, and pauses again")] = False,
-    hq: Annotated[
-        list[str] | None,
-        typer.Option(help="serve old HQ programs: PROTOCOL:PORT, PROTOCOL:HOST:PORT or a file with [[hq]]"),
-    ] = None,
-    as_robot: Annotated[
-        str, typer.Option("--as-robot", help="be the legacy robot itself, from its raw frames; the protocol's name")
-    ] = "",
-    listen: Annotated[
-        list[str] | None, typer.Option(help="where the legacy robot listens, tcp://host:port; once for each link")
-    ] = None,
+    hq: HqListeners = None,
+    as_robot: AsRobot = "",
+    listen: Listen = None,
     connect: Connect = [],  # noqa: B006
     tls: TlsFolder = None,
     realm: Realm = "fleet",
 ) -> None:
     """Replay a recording onto the bus under another name, or to a gateway as the legacy robot itself."""
-    from zbridge.cli import replayed
+    from zbridge.cli.recording import ReplayOptions, run_replay, run_wire
 
     set_up_log(verbose=False, level=logging.WARNING)
     if bool(as_robot) != bool(listen):
@@ -150,9 +155,9 @@ def replay(
     if as_robot:
         if hq or loop or pause or since or until:
             give_up(2, "--as-robot replays a recording once and whole: no --hq, --loop, --pause, --from, --to")
-        run_loop(replayed.run_wire(file, as_robot, listen or [], robot or [], speed, realm))
+        run_loop(run_wire(file, as_robot, listen or [], robot or [], speed, realm))
         return
-    options = replayed.ReplayOptions(
+    options = ReplayOptions(
         path=file,
         realm=realm,
         robots=tuple(robot or ()),
@@ -163,4 +168,4 @@ def replay(
         pause=pause,
         hq=tuple(hq or ()),
     )
-    run_loop(replayed.run_replay(bus_settings(connect, tls), options))
+    run_loop(run_replay(bus_settings(connect, tls), options))

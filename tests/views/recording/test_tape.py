@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from tests.views.recording import files
-from zbridge.views.recording import files as written
-from zbridge.views.recording.channels import channel_of
-from zbridge.views.recording.files import CHUNK_S, Tape, TapeSettings
-from zbridge.views.recording.reader import Reader
+from zbridge.views.recording import tape as written
+from zbridge.views.recording.contents import channel_of
+from zbridge.views.recording.reader import RecordingReader
+from zbridge.views.recording.tape import CHUNK_S, Tape, TapeSettings
 
 KEY = "fleet/r1/scan"
 NOISE = [os.urandom(200_000) for _ in range(10)]
@@ -59,7 +59,7 @@ def test_a_full_chunk_is_on_the_disk_at_once(tmp_path: Path) -> None:
 
 def messages(path: Path) -> int:
     with path.open("rb") as file:
-        return len(list(Reader(file).messages()))
+        return len(list(RecordingReader(file).messages()))
 
 
 class Disk:
@@ -93,7 +93,7 @@ def test_a_full_disk_leaves_a_file_that_ends_properly_and_counts_the_rest(
     monkeypatch.setattr(written.os, "ftruncate", lambda descriptor, to: _freeing(disk, descriptor, size, to))
     assert tape.salvage()
     kept = files.read(tmp_path / "a.mcap")
-    assert (len(kept), tape.unwritten.by_key) == (4, {KEY: 1})
+    assert (len(kept), dict(tape.unwritten)) == (4, {KEY: 1})
 
 
 def _freeing(disk: Disk, descriptor: int, size: int, to: int, truncate=os.ftruncate) -> None:  # type: ignore[no-untyped-def]
@@ -114,7 +114,7 @@ def test_a_disk_without_room_for_the_end_gives_back_the_last_chunk(
     monkeypatch.setattr(written.os, "ftruncate", lambda descriptor, to: _freeing(disk, descriptor, size, to))
     assert tape.salvage()
     assert len(files.read(tmp_path / "a.mcap")) == 2
-    assert tape.unwritten.by_key == {KEY: 1}
+    assert dict(tape.unwritten) == {KEY: 1}
 
 
 def test_a_split_recording_keeps_its_last_files_and_each_stands_for_itself(tmp_path: Path) -> None:

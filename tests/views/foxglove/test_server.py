@@ -22,14 +22,15 @@ from zbridge.errors import ConfigError
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.views.foxglove.admission import Policy
-from zbridge.views.foxglove.front import MESSAGE_BYTES, Front, tls_context
 from zbridge.views.foxglove.hub import Hub
-from zbridge.views.foxglove.source import Source
-from zbridge.views.pictures import Channel, Schema
+from zbridge.views.foxglove.server import MESSAGE_BYTES, ViewerServer, tls_context
+from zbridge.views.foxglove.source import ViewerSource
+from zbridge.views.pictures import ViewerChannel
+from zbridge.views.schemas import Schema
 
 HOST = "127.0.0.1"
 FOXGLOVE = Origin("https://app.foxglove.dev")
-POSE = Channel("/r1/pose", "pose", Schema("S", "jsonschema", b"{}", "json"))
+POSE = ViewerChannel("/r1/pose", "pose", Schema("S", "jsonschema", b"{}", "json"))
 
 
 class Scene:
@@ -38,13 +39,13 @@ class Scene:
     def __init__(self, policy: Policy, tls: ssl.SSLContext | None = None) -> None:
         self.hub, self.metrics = Hub(), Metrics()
         self.hub.offer([POSE])
-        self.front = Front(Source(self.hub), Address(HOST, 0), policy, self.metrics, tls)
+        self.server = ViewerServer(ViewerSource(self.hub), Address(HOST, 0), policy, self.metrics, tls)
         self.scheme = "ws" if tls is None else "wss"
         self._open = contextlib.AsyncExitStack()
 
     async def connect(self, path: str = "/", **options: Any) -> ClientConnection:
         settings = {"subprotocols": [Subprotocol("foxglove.sdk.v1")], "proxy": None, **options}
-        url = f"{self.scheme}://{HOST}:{self.front.address.port}{path}"
+        url = f"{self.scheme}://{HOST}:{self.server.address.port}{path}"
         return await self._open.enter_async_context(connect(url, **settings))
 
     async def refused(self, path: str = "/", **options: Any) -> int:
@@ -56,12 +57,12 @@ class Scene:
     async def until(self, viewers: int) -> None:
         """Wait for a number of viewers, and of connections."""
         async with asyncio.timeout(10.0):
-            while len(self.front.viewers) != viewers or self.front.open != viewers:  # noqa: ASYNC110
+            while len(self.server.viewers) != viewers or self.server.open != viewers:  # noqa: ASYNC110
                 await asyncio.sleep(0.001)
 
     def turned_away(self, reason: str) -> int:
-        assert self.metrics.count("foxglove_refused", reason=reason).value == self.front.refused[reason]
-        return self.front.refused[reason]
+        assert self.metrics.count("foxglove_refused", reason=reason).value == self.server.refused[reason]
+        return self.server.refused[reason]
 
     async def close(self) -> None:
         await self._open.aclose()
@@ -70,7 +71,7 @@ class Scene:
 @contextlib.asynccontextmanager
 async def serving(policy: Policy | None = None, tls: ssl.SSLContext | None = None) -> AsyncIterator[Scene]:
     scene = Scene(policy or Policy(), tls)
-    async with scene.front.serve():
+    async with scene.server.serve():
         try:
             yield scene
         finally:
@@ -89,7 +90,7 @@ async def test_a_connection_becomes_a_viewer_that_is_shown_the_channels_and_thei
                 await asyncio.sleep(0.001)
         scene.hub.publish("/r1/pose", 5, b"here")
         assert await client.recv() == b"\x01" + bytes([7, 0, 0, 0, 5, 0, 0, 0, 0, 0, 0, 0]) + b"here"
-        (viewer,) = scene.front.viewers
+        (viewer,) = scene.server.viewers
         assert (viewer.name, viewer.may_drive) == ("foxglove.ann.1", False)
         await client.close()
         await scene.until(viewers=0)
@@ -102,7 +103,7 @@ async def test_viewers_have_numbers_of_their_own_and_drive_where_that_is_allowed
         await scene.connect("/?name=ann", origin=FOXGLOVE)
         await scene.connect("/?name=ann")
         await scene.until(viewers=2)
-        found = sorted((viewer.name, viewer.may_drive) for viewer in scene.front.viewers)
+        found = sorted((viewer.name, viewer.may_drive) for viewer in scene.server.viewers)
         assert found == [("foxglove.ann.1", True), ("foxglove.ann.2", False)]
 
 
@@ -122,19 +123,19 @@ async def test_who_is_not_admitted_is_turned_away_with_a_status_and_counted() ->
 
 async def test_a_connection_of_another_network_is_closed_before_it_says_anything() -> None:
     async with serving(Policy(networks=(ipaddress.ip_network("10.0.0.0/8"),))) as scene:
-        reader, writer = await asyncio.open_connection(HOST, scene.front.address.port)
+        reader, writer = await asyncio.open_connection(HOST, scene.server.address.port)
         with contextlib.suppress(ConnectionError):
             assert await reader.read() == b""
         writer.close()
-        assert (scene.turned_away("network"), scene.front.open) == (1, 0)
+        assert (scene.turned_away("network"), scene.server.open) == (1, 0)
 
 
 async def test_connections_in_their_handshake_are_bounded_too() -> None:
     async with serving(Policy(viewers=1)) as scene:
-        silent = [await asyncio.open_connection(HOST, scene.front.address.port) for _ in range(3)]
+        silent = [await asyncio.open_connection(HOST, scene.server.address.port) for _ in range(3)]
         with contextlib.suppress(ConnectionError):
             assert await silent[2][0].read() == b""
-        assert (scene.turned_away("full"), scene.front.open) == (1, 2)
+        assert (scene.turned_away("full"), scene.server.open) == (1, 2)
         for _, writer in silent:
             writer.close()
         await scene.until(viewers=0)
@@ -157,9 +158,9 @@ async def test_a_viewer_that_breaks_a_limit_is_told_and_ended(monkeypatch: pytes
 async def test_an_address_in_use_and_files_that_are_no_certificate_are_told(tmp_path: Path) -> None:
     with socket.create_server((HOST, 0)) as taken:
         port = taken.getsockname()[1]
-        front = Front(Source(Hub()), Address(HOST, port), Policy(), Metrics())
+        server = ViewerServer(ViewerSource(Hub()), Address(HOST, port), Policy(), Metrics())
         with pytest.raises(ConfigError, match=f"--listen tcp://{HOST}:{port}: .*[Aa]ddress already in use"):
-            await front.serve().__aenter__()
+            await server.serve().__aenter__()
     with pytest.raises(ConfigError, match=r"--tls-certificate no\.pem, --tls-key no\.key"):
         tls_context("no.pem", "no.key")
 

@@ -11,7 +11,7 @@ from tests.views.protobuf import read
 from zbridge.fleet import messages as m
 from zbridge.fleet import topics
 from zbridge.fleet.topics import Topic
-from zbridge.views.pictures import Picture, RobotPictures, channels_of, sources_of
+from zbridge.views.pictures import FoxglovePictures, Picture, channels_of, sources_of
 
 NOW_NS = 1_700_000_000_000_000_000
 SECOND_NS = 10**9
@@ -77,14 +77,14 @@ def test_what_keeps_its_last_value_on_the_bus_keeps_it_for_viewers() -> None:
 
 
 def test_a_picture_has_the_time_of_measurement_or_else_of_arrival() -> None:
-    robot = RobotPictures("r1")
+    robot = FoxglovePictures("r1")
     for stamp_ns, expected in ((7, 7), (msgspec.UNSET, NOW_NS), (-1, NOW_NS), (2**62, NOW_NS)):
         pictures = robot.draw(topics.MOTION, m.Motion(speed=1.0, stamp_ns=stamp_ns), NOW_NS)
         assert [picture.stamp_ns for picture in pictures] == [expected]
 
 
 def test_only_wanted_channels_are_drawn() -> None:
-    robot = RobotPictures("r1")
+    robot = FoxglovePictures("r1")
     pose = m.Pose(0.0, 0.0, 0.0)
     assert names(robot.draw(topics.POSE, pose, NOW_NS, {"tf"})) == ["/r1/tf"]
     assert names(robot.draw(topics.POSE, pose, NOW_NS, ())) == []
@@ -92,7 +92,7 @@ def test_only_wanted_channels_are_drawn() -> None:
 
 
 def test_frames_come_with_every_pose_and_once_a_second_where_only_scans_come() -> None:
-    robot = RobotPictures("r1")
+    robot = FoxglovePictures("r1")
 
     def frames(topic: Topic, message: m.FleetMessage, after_s: float) -> list[list[str]]:
         pictures = robot.draw(
@@ -111,7 +111,7 @@ def test_frames_come_with_every_pose_and_once_a_second_where_only_scans_come() -
 
 
 def test_a_trail_grows_by_what_the_robot_moves_and_no_further_than_its_bound() -> None:
-    robot = RobotPictures("r1")
+    robot = FoxglovePictures("r1")
     drawn = []
     for step in range(1000):
         pose = m.Pose(step * 0.02, 0.0, 0.0, stamp_ns=NOW_NS + step * SECOND_NS)
@@ -124,18 +124,18 @@ def test_a_trail_grows_by_what_the_robot_moves_and_no_further_than_its_bound() -
 
 
 def test_a_trail_is_drawn_at_most_five_times_a_second() -> None:
-    robot = RobotPictures("r1")
+    robot = FoxglovePictures("r1")
     poses = [m.Pose(float(step), 0.0, 0.0, stamp_ns=NOW_NS + step * SECOND_NS // 20) for step in range(21)]
     assert sum(len(robot.draw(topics.POSE, pose, 0, {"trail"})) for pose in poses) == 6
 
 
-def log(robot: RobotPictures, topic: Topic, message: m.FleetMessage) -> list[tuple[str, str, str]]:
+def log(robot: FoxglovePictures, topic: Topic, message: m.FleetMessage) -> list[tuple[str, str, str]]:
     fields = [read(drawn.channel.schema, drawn.payload) for drawn in robot.draw(topic, message, NOW_NS, {"log"})]
     return [(entry["level"], entry["name"], entry["message"]) for entry in fields]
 
 
 def test_the_log_has_texts_changes_of_state_and_refusals_that_are_new() -> None:
-    robot = RobotPictures("r1")
+    robot = FoxglovePictures("r1")
     assert log(robot, topics.TEXT, m.Text("hello")) == [("DEBUG", "r1", "hello")]
     assert log(robot, topics.TEXT, m.Text("hi", "chat", "anna")) == [("INFO", "anna", "hi")]
     assert log(robot, topics.STATUS, m.Status("offline", "no answer")) == [("WARNING", "r1", "offline: no answer")]
@@ -148,7 +148,7 @@ def test_the_log_has_texts_changes_of_state_and_refusals_that_are_new() -> None:
 
 
 def test_json_has_the_fields_of_the_message_and_its_schema_names_them() -> None:
-    robot = RobotPictures("r1")
+    robot = FoxglovePictures("r1")
     message = m.Control("held", holder="op", lease=b"\x01" * 8, expires_in_s=math.nan, refusals=(REFUSED,), seq=3)
     (picture,) = robot.draw(topics.CONTROL, message, NOW_NS, {"control"})
     fields = json.loads(picture.payload)
@@ -181,11 +181,11 @@ NOTHING = [
 
 @pytest.mark.parametrize(("topic", "message"), NOTHING)
 def test_what_has_no_content_has_no_picture(topic: Topic, message: m.FleetMessage) -> None:
-    assert RobotPictures("r1").draw(topic, message, NOW_NS, {"pose", "map", "trail", "image"}) == []
+    assert FoxglovePictures("r1").draw(topic, message, NOW_NS, {"pose", "map", "trail", "image"}) == []
 
 
 def test_a_map_a_scan_and_an_image_stand_in_the_frames_of_their_robot() -> None:
-    robot = RobotPictures("r.2")
+    robot = FoxglovePictures("r.2")
     (grid,) = robot.draw(topics.MAP, MAP, NOW_NS)
     (scan,) = robot.draw(topics.SCAN, SCAN, NOW_NS, {"scan"})
     (image,) = robot.draw(topics.IMAGE, m.Image("jpeg", b"\xff\xd8"), NOW_NS)

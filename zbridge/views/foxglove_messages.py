@@ -12,26 +12,6 @@ from functools import lru_cache
 
 import foxglove.messages as fox
 import numpy as np
-from foxglove.messages import (
-    Color,
-    CompressedImage,
-    FrameTransform,
-    FrameTransforms,
-    Grid,
-    LinePrimitive,
-    LinePrimitiveLineType,
-    Log,
-    LogLevel,
-    PackedElementField,
-    PackedElementFieldNumericType,
-    Point3,
-    PoseInFrame,
-    Quaternion,
-    SceneEntity,
-    SceneUpdate,
-    Vector2,
-    Vector3,
-)
 
 from zbridge.fleet.messages import Map, Pose, Scan
 
@@ -39,17 +19,17 @@ _S_NS = 1_000_000_000
 _ANGLES = struct.Struct("<BdBdB")
 _START_ANGLE, _END_ANGLE, _RANGES = 0x21, 0x29, 0x32
 """Tags of ``foxglove.LaserScan``: field number and wire type."""
-_NO_TURN = Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
-_HERE = fox.Pose(position=Vector3(x=0.0, y=0.0, z=0.0), orientation=_NO_TURN)
-_TRAIL_COLOR = Color(r=0.2, g=0.6, b=1.0, a=0.9)
+_NO_TURN = fox.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
+_HERE = fox.Pose(position=fox.Vector3(x=0.0, y=0.0, z=0.0), orientation=_NO_TURN)
+_TRAIL_COLOR = fox.Color(r=0.2, g=0.6, b=1.0, a=0.9)
 _TRAIL_M = 0.03
 _MAP_Z_M = -0.02
 """A map lies below what is drawn on it: viewers show one of two things in the same plane by chance."""
 _CELL_COLORS = np.array([(127, 127, 127, 64), (240, 240, 240, 255), (20, 20, 20, 255), (255, 0, 255, 255)], np.uint8)
 """Red, green, blue, alpha of an unknown, a free and an occupied cell, and of one with another value."""
-_UINT8 = PackedElementFieldNumericType.Uint8
+_UINT8 = fox.PackedElementFieldNumericType.Uint8
 _CELL_FIELDS = [
-    PackedElementField(name=name, offset=offset, type=_UINT8)
+    fox.PackedElementField(name=name, offset=offset, type=_UINT8)
     for offset, name in enumerate(("red", "green", "blue", "alpha"))
 ]
 
@@ -64,19 +44,19 @@ def laser_scan(scan: Scan, frame: str, stamp_ns: int) -> bytes:
 
 def pose_in_frame(pose: Pose, frame: str, stamp_ns: int) -> bytes:
     """Encode ``foxglove.PoseInFrame``."""
-    placed = fox.Pose(position=Vector3(x=pose.x, y=pose.y, z=0.0), orientation=_turned(pose.heading))
-    return PoseInFrame(timestamp=_time(stamp_ns), frame_id=frame, pose=placed).encode()
+    placed = fox.Pose(position=fox.Vector3(x=pose.x, y=pose.y, z=0.0), orientation=_turned(pose.heading))
+    return fox.PoseInFrame(timestamp=_time(stamp_ns), frame_id=frame, pose=placed).encode()
 
 
 def transforms(placed: Iterable[tuple[str, str, Pose | None]], stamp_ns: int) -> bytes:
     """Encode ``foxglove.FrameTransforms`` of (parent frame, child frame, the child's pose; None: the same place)."""
-    return FrameTransforms(
+    return fox.FrameTransforms(
         transforms=[
-            FrameTransform(
+            fox.FrameTransform(
                 timestamp=_time(stamp_ns),
                 parent_frame_id=parent,
                 child_frame_id=child,
-                translation=Vector3(x=pose.x, y=pose.y, z=0.0) if pose else Vector3(x=0.0, y=0.0, z=0.0),
+                translation=fox.Vector3(x=pose.x, y=pose.y, z=0.0) if pose else fox.Vector3(x=0.0, y=0.0, z=0.0),
                 rotation=_turned(pose.heading) if pose else _NO_TURN,
             )
             for parent, child, pose in placed
@@ -87,12 +67,12 @@ def transforms(placed: Iterable[tuple[str, str, Pose | None]], stamp_ns: int) ->
 def grid(map_: Map, frame: str, stamp_ns: int) -> bytes:
     """Encode ``foxglove.Grid``: a colour for each cell, transparent where unknown."""
     x, y = map_.origin
-    return Grid(
+    return fox.Grid(
         timestamp=_time(stamp_ns),
         frame_id=frame,
-        pose=fox.Pose(position=Vector3(x=x, y=y, z=_MAP_Z_M), orientation=_NO_TURN),
+        pose=fox.Pose(position=fox.Vector3(x=x, y=y, z=_MAP_Z_M), orientation=_NO_TURN),
         column_count=map_.columns,
-        cell_size=Vector2(x=map_.cell, y=map_.cell),
+        cell_size=fox.Vector2(x=map_.cell, y=map_.cell),
         row_stride=map_.columns * len(_CELL_FIELDS),
         cell_stride=len(_CELL_FIELDS),
         fields=_CELL_FIELDS,
@@ -100,35 +80,35 @@ def grid(map_: Map, frame: str, stamp_ns: int) -> bytes:
     ).encode()
 
 
-def log(text: str, level: LogLevel, name: str, stamp_ns: int) -> bytes:
+def log(text: str, level: fox.LogLevel, name: str, stamp_ns: int) -> bytes:
     """Encode ``foxglove.Log``. name: who says it."""
-    return Log(timestamp=_time(stamp_ns), level=level, message=text, name=name).encode()
+    return fox.Log(timestamp=_time(stamp_ns), level=level, message=text, name=name).encode()
 
 
 def compressed_image(data: bytes, image_format: str, frame: str, stamp_ns: int) -> bytes:
     """Encode ``foxglove.CompressedImage``. image_format: ``jpeg``, ``png`` or ``webp``."""
-    return CompressedImage(timestamp=_time(stamp_ns), frame_id=frame, data=data, format=image_format).encode()
+    return fox.CompressedImage(timestamp=_time(stamp_ns), frame_id=frame, data=data, format=image_format).encode()
 
 
 def trail(points: Iterable[tuple[float, float]], frame: str, stamp_ns: int) -> bytes:
     """Encode ``foxglove.SceneUpdate``: a line through x, y of the points, instead of the one before."""
-    line = LinePrimitive(
-        type=LinePrimitiveLineType.LineStrip,
+    line = fox.LinePrimitive(
+        type=fox.LinePrimitiveLineType.LineStrip,
         pose=_HERE,
         thickness=_TRAIL_M,
-        points=[Point3(x=x, y=y, z=0.0) for x, y in points],
+        points=[fox.Point3(x=x, y=y, z=0.0) for x, y in points],
         color=_TRAIL_COLOR,
     )
-    entity = SceneEntity(timestamp=_time(stamp_ns), frame_id=frame, id="trail", lines=[line])
-    return SceneUpdate(entities=[entity]).encode()
+    entity = fox.SceneEntity(timestamp=_time(stamp_ns), frame_id=frame, id="trail", lines=[line])
+    return fox.SceneUpdate(entities=[entity]).encode()
 
 
 def _time(stamp_ns: int) -> fox.Timestamp:
     return fox.Timestamp(*divmod(stamp_ns, _S_NS))
 
 
-def _turned(heading: float) -> Quaternion:
-    return Quaternion(x=0.0, y=0.0, z=math.sin(heading / 2), w=math.cos(heading / 2))
+def _turned(heading: float) -> fox.Quaternion:
+    return fox.Quaternion(x=0.0, y=0.0, z=math.sin(heading / 2), w=math.cos(heading / 2))
 
 
 def _timestamp(stamp_ns: int) -> bytes:

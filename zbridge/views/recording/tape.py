@@ -20,8 +20,9 @@ from typing import Any, Literal
 import msgspec
 
 from zbridge.errors import ConfigError
-from zbridge.views.recording.channels import ChannelKind
+from zbridge.views.recording.contents import ChannelKind
 from zbridge.views.recording.intake import Losses
+from zbridge.views.recording.reader import EXTRA
 
 CHUNK_BYTES = 2**20
 """Bytes of a chunk, uncompressed, about."""
@@ -37,7 +38,6 @@ _END = struct.pack("<BQI", 0x0F, 4, 0) + struct.pack("<BQQQI", 0x02, 20, 0, 0, 0
 """End of the data, a footer without summary, the magic bytes."""
 
 Compression = Literal["zstd", "lz4", "none"]
-EXTRA = "needs the extra: pip install 'zbridge[foxglove]'"
 
 
 class TapeSettings(msgspec.Struct, frozen=True):
@@ -61,60 +61,45 @@ class TapeSettings(msgspec.Struct, frozen=True):
         return self.path.with_name(f"{self.path.stem}-{number:04d}{self.path.suffix}")
 
 
-class Block(msgspec.Struct):
-    """What one write to the disk held: where it began, and its messages by topic."""
-
-    offset: int
-    counts: dict[str, int]
-
-
 class OutputFile:
     """A new file, written in blocks; raises FileExistsError, OSError."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._descriptor = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_CLOEXEC, 0o644)
-        self._pending = bytearray()
-        self._written = 0
+        self.pending = bytearray()
+        """Gathered for the next flush."""
+        self.written = 0
+        """Bytes that are in the file."""
 
     def __repr__(self) -> str:
         return f"<OutputFile {self.path} {self.tell()} bytes>"
 
-    @property
-    def pending(self) -> bool:
-        """Whether there is something to flush."""
-        return bool(self._pending)
-
-    @property
-    def written(self) -> int:
-        """Bytes that are in the file."""
-        return self._written
-
     def write(self, data: Any) -> int:
         """Gather bytes for the next flush."""
-        self._pending += data
+        self.pending += data
         return len(data)
 
     def tell(self) -> int:
         """Return the size of the file with all that was gathered."""
-        return self._written + len(self._pending)
+        return self.written + len(self.pending)
 
     def flush(self) -> None:
         """Write what was gathered; raise OSError where not all of it could be written."""
-        view = memoryview(self._pending)
+        view = memoryview(self.pending)
         done = 0
         while done < len(view):
             done += os.write(self._descriptor, view[done:])
         view.release()
-        self._written += done
-        self._pending = bytearray()
+        self.written += done
+        self.pending = bytearray()
 
     def cut(self, size: int) -> None:
         """Forget what was gathered, and all that was written behind ``size``."""
-        self._pending = bytearray()
+        self.pending = bytearray()
         os.ftruncate(self._descriptor, size)
         os.lseek(self._descriptor, size, os.SEEK_SET)
-        self._written = size
+        self.written = size
 
     def close(self) -> None:
         """Close the file; idempotent."""
@@ -140,7 +125,8 @@ class Tape:
         self._writer: Any = None
         self._schemas: dict[str, int] = {}
         self._channels = 0
-        self._blocks: deque[Block] = deque(maxlen=_BLOCKS)
+        self._blocks: deque[tuple[int, dict[str, int]]] = deque(maxlen=_BLOCKS)
+        """What each write to the disk held: where it began, and its messages by topic."""
         self._counts: dict[str, int] = {}
         self._entries = 0
         self._whole = 0
@@ -244,9 +230,8 @@ class Tape:
                 if len(self._blocks) < 2:  # the first block is the header
                     self._release()
                     return False
-                block = self._blocks.pop()
-                self._lose(block.counts)
-                size = block.offset
+                size, counts = self._blocks.pop()
+                self._lose(counts)
             else:
                 self._release()
                 return True
@@ -260,7 +245,7 @@ class Tape:
         file = self._file
         assert file is not None
         file.flush()
-        self._blocks.append(Block(self._whole, self._counts))
+        self._blocks.append((self._whole, self._counts))
         self._whole = file.written  # not before this: the library flushes the file itself, too
         self._entries += len(self._counts) + 1
         self._counts, self._flushed = {}, now

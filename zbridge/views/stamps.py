@@ -1,8 +1,10 @@
-"""Moves the stamp of a payload, which keeps all else as it was. Sans-IO."""
+"""Stamps of fleet messages: when a message was measured, and a new stamp in a payload. Sans-IO."""
 
 from __future__ import annotations
 
 import struct
+
+from msgspec import UnsetType
 
 from zbridge.errors import PayloadError
 from zbridge.fleet import payload as payloads
@@ -12,6 +14,11 @@ _NAME = b"\xa8stamp_ns\xcf"
 _AT = 1 + len(_NAME)
 _MAPS = range(0x80, 0x90)
 _LARGEST = 2**64 - 1
+
+
+def measured_ns(stamp_ns: int | UnsetType, now_ns: int, end_ns: int) -> int:
+    """Return the stamp, Unix nanoseconds; ``now_ns`` where there is none, or none from 0 to before ``end_ns``."""
+    return stamp_ns if isinstance(stamp_ns, int) and 0 <= stamp_ns < end_ns else now_ns
 
 
 def with_stamp(payload: bytes, stamp_ns: int) -> bytes:

@@ -1,6 +1,6 @@
 """The time of a recording: runs at its speed, rests, jumps, ends."""
 
-from zbridge.views.foxglove.playback_clock import PlaybackClock
+from zbridge.views.recording.player import PlaybackClock
 
 S = 10**9
 

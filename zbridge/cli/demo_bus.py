@@ -1,4 +1,4 @@
-"""The bus of ``zbridge demo --secure``: a router, and certificates made on the fly in a temporary folder.
+"""The processes of ``zbridge demo``, and the bus of ``zbridge demo --secure``: a router, and temporary certificates.
 
 A viewer's session looks, an operator's drives, and each robot's gateway speaks for its robot alone. The folders of the
 members stay as long as the demo runs, for commands in another terminal.
@@ -9,7 +9,11 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import importlib.util
-from collections.abc import AsyncIterator, Callable
+import os
+import random
+import socket
+import sys
+from collections.abc import AsyncIterator, Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO
@@ -19,29 +23,81 @@ import msgspec
 from zbridge.app.roles import Member
 from zbridge.bus import Bus, open_bus
 from zbridge.bus.tls.files import folder_settings
-from zbridge.cli.processes import free_port, process
 from zbridge.client import Fleet
 from zbridge.errors import BusError, ConfigError
 from zbridge.metrics import Metrics
+
+END_S = 3.0
+"""Longest time processes are given to end by themselves."""
+
+
+def free_port() -> int:
+    """Return a port that is free for TCP and UDP, outside the range from which the system assigns ports."""
+    while True:
+        port = random.randrange(20_000, 32_000)
+        with contextlib.suppress(OSError), socket.socket() as tcp, socket.socket(type=socket.SOCK_DGRAM) as udp:
+            tcp.bind(("127.0.0.1", port))
+            udp.bind(("127.0.0.1", port))
+            return port
+
+
+@contextlib.asynccontextmanager
+async def process(
+    log: IO[bytes], *arguments: str, read: bool = False, state: Path | None = None
+) -> AsyncIterator[asyncio.subprocess.Process]:
+    """Run a command of ``zbridge`` while the context lasts.
+
+    read: its standard output is a pipe. state: a folder of its own for what it keeps over a restart.
+    """
+    own = {"STATE_DIRECTORY": str(state)} if state is not None else {}
+    started = await asyncio.create_subprocess_exec(
+        sys.executable,
+        *("-m", "zbridge", *arguments),
+        stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.PIPE if read else asyncio.subprocess.DEVNULL,
+        stderr=log,
+        env={**os.environ, "PYTHONUNBUFFERED": "1", **own},
+    )
+    try:
+        yield started
+    finally:
+        await end((started,))
+
+
+async def end(processes: Sequence[asyncio.subprocess.Process]) -> None:
+    """End processes together; kill those that still run after :data:`END_S`."""
+    for process in processes:
+        with contextlib.suppress(ProcessLookupError):
+            process.terminate()
+    ended = asyncio.gather(*(process.wait() for process in processes))
+    try:
+        async with asyncio.timeout(END_S):
+            await asyncio.shield(ended)
+    except TimeoutError:
+        for process in processes:
+            with contextlib.suppress(ProcessLookupError):
+                process.kill()
+        await ended
+
 
 REALM = "fleet"
 START_S = 20.0
 """Longest time a process may take to start."""
 DAYS = 60
 """How long the certificates are valid: no warning of their end is shown."""
-_ROUTER, _LOOKS, _DRIVES, _READER = "hub", "screen", "demo", "you"
+_ROUTER, _VIEWER, _OPERATOR, _READER = "hub", "screen", "demo", "you"
 
 
 class DemoBus(msgspec.Struct, frozen=True):
     """How the parts of a demo use its bus.
 
-    looking: the session of the table. driving: the robots as the program that drives them sees them. table: the
+    viewer: the session of the table. operator: the robots as the program that drives them sees them. table: the
     ``[bus]`` table of a robot's gateway. commands: what to try in another terminal.
     """
 
     endpoint: str
-    looking: Bus
-    driving: Fleet
+    viewer: Bus
+    operator: Fleet
     table: Callable[[str], str]
     commands: tuple[str, ...]
 
@@ -55,14 +111,14 @@ async def secure_bus(folder: Path, log: IO[bytes], robots: list[str]) -> AsyncIt
     async with contextlib.AsyncExitStack() as stack:
         listening = ("--listen", endpoint, "--tls", str(folder / _ROUTER), "--roles", str(roles))
         await stack.enter_async_context(process(log, "router", *listening))
-        looking = await stack.enter_async_context(_joined(folder / _LOOKS))
-        driving = await stack.enter_async_context(_joined(folder / _DRIVES))
+        viewer = await stack.enter_async_context(_joined(folder / _VIEWER))
+        operator = await stack.enter_async_context(_joined(folder / _OPERATOR))
         commands = (
-            f"zbridge ls --sessions --tls {folder / _LOOKS}     # a viewer: looks and stops, and drives nothing",
+            f"zbridge ls --sessions --tls {folder / _VIEWER}     # a viewer: looks and stops, and drives nothing",
             f"zbridge drive {robots[0]} --tls {folder / _READER}     # an operator",
         )
-        fleet = Fleet(driving, REALM, _DRIVES)
-        yield DemoBus(endpoint, looking, fleet, lambda robot: _table(folder / gateways[robot]), commands)
+        fleet = Fleet(operator, REALM, _OPERATOR)
+        yield DemoBus(endpoint, viewer, fleet, lambda robot: _table(folder / gateways[robot]), commands)
 
 
 def make_members(folder: Path, endpoint: str, gateways: dict[str, str]) -> Path:
@@ -78,8 +134,8 @@ def make_members(folder: Path, endpoint: str, gateways: dict[str, str]) -> Path:
 
     members = {
         _ROUTER: Member("router"),
-        _LOOKS: Member("viewer"),
-        _DRIVES: Member("operator"),
+        _VIEWER: Member("viewer"),
+        _OPERATOR: Member("operator"),
         _READER: Member("operator"),
         **{name: Member("gateway", (robot,), listeners=True) for robot, name in gateways.items()},
     }

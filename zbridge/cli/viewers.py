@@ -1,0 +1,69 @@
+"""``zbridge foxglove, ros2``: serve robots, or a recording, to viewers."""
+
+from __future__ import annotations
+
+import gc
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from zbridge.app import until_signal
+from zbridge.app.toml import convert, read_toml
+from zbridge.bus import BusSettings
+from zbridge.bus.tls.member import own_name, own_role
+from zbridge.cli import run_loop
+from zbridge.errors import ConfigError
+from zbridge.metrics import Metrics
+
+if TYPE_CHECKING:
+    from zbridge.views.foxglove.server import ViewerServer
+    from zbridge.views.foxglove.settings import FoxgloveOptions
+    from zbridge.views.ros2.server import View
+
+
+def run_foxglove(bus: BusSettings, realm: str, file: Path | None, given: dict[str, object]) -> None:
+    """Serve until SIGTERM or SIGINT; raise ConfigError. given: fields of FoxgloveOptions, as they were given."""
+    try:
+        from zbridge.views.foxglove import server
+        from zbridge.views.foxglove.settings import FoxgloveOptions, plan
+    except ImportError as error:
+        raise ConfigError(f"{error}: expected what `pip install 'zbridge[foxglove]'` installs") from error
+    gc.freeze()  # objects made at start-up live as long as the process; the collector skips them
+    given["who"] = given["who"] or own_name(bus.tls) or "foxglove"
+    options: FoxgloveOptions = FoxgloveOptions(**given)  # type: ignore[arg-type]
+    if options.drive and (role := own_role(bus.tls)) in ("viewer", "recorder"):
+        raise ConfigError(f"--drive: a {role} may not drive: expected the certificate of an operator")
+    planned, metrics = plan(options), Metrics()
+
+    def ready(viewers: ViewerServer) -> None:
+        scheme = "wss" if planned.tls is not None else "ws"
+        print(f"Foxglove connects to {scheme}://{str(viewers.address).removeprefix('tcp://')}", flush=True)  # noqa: T201
+
+    if file is None:
+        run_loop(until_signal(server.serve_live(planned, bus, realm, metrics, ready)))
+    else:
+        run_loop(until_signal(server.serve_file(planned, file, metrics, ready)))
+
+
+def run_ros2(bus: BusSettings | None, default: BusSettings, file: Path | None, given: dict[str, object]) -> None:
+    """Show robots until SIGTERM or SIGINT; raise ConfigError or BusError.
+
+    bus: as given by options, else the file's, else ``default``. given: fields of Ros2Settings that win over the file's.
+    """
+    from zbridge.views.ros2 import server
+    from zbridge.views.ros2.settings import Ros2Settings, plan
+
+    try:
+        written = convert(read_toml(file), Ros2Settings) if file is not None else Ros2Settings()
+        planned = plan(msgspec.structs.replace(written, **given))
+    except ConfigError as error:
+        named = file is not None and str(file) not in str(error)
+        raise ConfigError(f"{file}: {error}" if named else str(error)) from error
+
+    def ready(view: View) -> None:
+        gc.freeze()  # the types of ROS live as long as the process: the collector would take 18 ms to look at them
+        where = ", ".join(planned.ros.connect)
+        print(f"ROS 2 {planned.distro}, domain {planned.domain}, at {where}", flush=True)  # noqa: T201
+
+    run_loop(until_signal(server.serve(planned, bus or written.bus or default, Metrics(), ready)))

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import zenoh
 
-from zbridge.app.access import Column, Kind, column, granted
-from zbridge.app.roles import Member, Roles
+from zbridge.security.access import Column, Kind, column, granted
+from zbridge.security.roles import Member, Roles
 
 REALM = "fleet"
 OWN, OTHER = "r1", "r2"

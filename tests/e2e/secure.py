@@ -24,8 +24,8 @@ from tests.certificates import Authority
 from tests.e2e.conftest import HOST, WAIT_S, until
 from tests.machine import Patience
 from tests.ports import free_port
-from zbridge.app.access import Column, Keys, Kind, expressions
-from zbridge.app.roles import Member, Roles, save_roles
+from zbridge.security.access import Column, Keys, Kind, expressions
+from zbridge.security.roles import Member, Roles, save_roles
 
 FAR = "far"
 GRACE_S = 0.3

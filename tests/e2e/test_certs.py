@@ -15,17 +15,17 @@ import pytest
 import zenoh
 
 from tests.ports import free_port
-from zbridge.app.certs import authority
-from zbridge.app.certs.authority import Request
-from zbridge.app.certs.bundle import Packing, bundle
-from zbridge.app.certs.files import Folder, NameFiles
-from zbridge.app.roles import Member
 from zbridge.bus import BusSettings, open_bus
 from zbridge.errors import BusError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Pose
 from zbridge.metrics import Metrics
+from zbridge.security.certs import authority
+from zbridge.security.certs.authority import Request
+from zbridge.security.certs.bundle import Packing, bundle
+from zbridge.security.certs.files import Folder, NameFiles
+from zbridge.security.roles import Member
 
 KEY = "fleet/r1/pose"
 

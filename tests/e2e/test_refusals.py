@@ -21,14 +21,14 @@ from tests.e2e.test_certs import routing
 from tests.machine import Patience
 from tests.ports import free_port
 from zbridge.app import Gateway, load
-from zbridge.app.certs import authority
-from zbridge.app.certs.authority import Request
-from zbridge.app.certs.files import Folder
-from zbridge.app.member import check_member
-from zbridge.app.roles import Member
 from zbridge.bus import BusSettings
 from zbridge.cli.bus import list_robots
 from zbridge.errors import BusError, ConfigError
+from zbridge.security.certs import authority
+from zbridge.security.certs.authority import Request
+from zbridge.security.certs.files import Folder
+from zbridge.security.member import check_member
+from zbridge.security.roles import Member
 
 DAY = timedelta(days=1)
 ENDS_S = 8

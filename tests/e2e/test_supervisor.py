@@ -19,7 +19,7 @@ from tests.e2e.crossings import Case, Outcome, measure
 from tests.e2e.robots import MOVE, STOP, Robot, position
 from tests.e2e.steps import AFTER_GIVEN, AFTER_GO, FIRST_READ
 from tests.e2e.supervised import Supervised
-from zbridge.app.supervisor.runner import KEPT_CRASHES
+from zbridge.host.runner import KEPT_CRASHES
 
 ROBOTS = 8
 

@@ -17,7 +17,6 @@ from typing import Any
 
 import msgspec
 
-from zbridge.app.toml import convert, parse_toml, read_file
 from zbridge.bus import BusSettings
 from zbridge.bus.tls.files import TLS_VARIABLE, folder_settings, tls_beside
 from zbridge.camera import CameraPlan, CameraSettings, plan_camera
@@ -29,6 +28,7 @@ from zbridge.protocol.address import Address, DeviceAddress
 from zbridge.protocol.networks import parse_networks
 from zbridge.protocol.plugin import Protocol, find_protocol
 from zbridge.robot.settings import DevicePlan, DeviceSettings
+from zbridge.toml import convert, parse_toml, read_file
 from zbridge.transport import server_context
 
 _VARIABLE = re.compile(r"\$\{(\w+)\}")

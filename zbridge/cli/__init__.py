@@ -23,18 +23,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from zbridge.app import Gateway, load, until_signal
-from zbridge.app.addresses import hold_addresses
 from zbridge.app.handover import Spawn
-from zbridge.app.host import HostSettings, require_different_robots, require_one_bus
-from zbridge.app.member import check_member
-from zbridge.app.together import Together
-from zbridge.app.toml import read_file
 from zbridge.bus.tls.files import TLS_VARIABLE
 from zbridge.errors import ConfigError, ZbridgeError
 from zbridge.fleet.printable import shown
+from zbridge.host.addresses import hold_addresses
+from zbridge.host.settings import HostSettings, require_different_robots, require_one_bus
+from zbridge.host.together import Together
+from zbridge.security.member import check_member
+from zbridge.toml import read_file
 
 if TYPE_CHECKING:  # loaded where there is a supervisor only
-    from zbridge.app.supervisor.child import Reporter
+    from zbridge.host.child import Reporter
 
 
 def main() -> None:

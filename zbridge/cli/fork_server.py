@@ -5,11 +5,11 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from zbridge.app.supervisor.child import Reporter
-from zbridge.app.supervisor.fork_server import Birth, serve
-from zbridge.app.supervisor.post import Post
 from zbridge.cli import give_up, run_gateway, set_up_log
 from zbridge.errors import ConfigError, ZbridgeError
+from zbridge.host.child import Reporter
+from zbridge.host.fd_channel import Post
+from zbridge.host.fork_server import Birth, serve
 
 
 def main() -> None:

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from zbridge.app import until_signal
-from zbridge.app.toml import convert, read_toml
 from zbridge.bus import BusSettings
 from zbridge.cli import run_loop
 from zbridge.errors import ConfigError
 from zbridge.metrics import Metrics
+from zbridge.toml import convert, read_toml
 
 if TYPE_CHECKING:
     from zbridge.views.ros2.server import View

@@ -16,13 +16,13 @@ from typing import IO
 
 import msgspec
 
-from zbridge.app.roles import Member
 from zbridge.bus import Bus, open_bus
 from zbridge.bus.tls.files import folder_settings
 from zbridge.cli.processes import free_port, process
 from zbridge.client import Fleet
 from zbridge.errors import BusError, ConfigError
 from zbridge.metrics import Metrics
+from zbridge.security.roles import Member
 
 REALM = "fleet"
 START_S = 20.0
@@ -72,9 +72,9 @@ def make_members(folder: Path, endpoint: str, gateways: dict[str, str]) -> Path:
     """
     if importlib.util.find_spec("cryptography") is None:
         raise ConfigError("zbridge demo --secure needs the package cryptography: pip install 'zbridge[certs]'")
-    from zbridge.app.certs import authority
-    from zbridge.app.certs.bundle import Packing, bundle
-    from zbridge.app.certs.files import Folder
+    from zbridge.security.certs import authority
+    from zbridge.security.certs.bundle import Packing, bundle
+    from zbridge.security.certs.files import Folder
 
     members = {
         _ROUTER: Member("router"),

@@ -6,13 +6,13 @@ from datetime import UTC, datetime
 
 import pytest
 
-from zbridge.app.access import GRANTS, Keys, Kind
 from zbridge.bus import Answer
 from zbridge.bus.tls.certificate import Certificate
 from zbridge.bus.tls.membership import Right, lacking, require_member, router_id
 from zbridge.errors import BusError, BusRefused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import Membership
+from zbridge.security.access import GRANTS, Keys, Kind
 
 NOW = datetime(2026, 11, 22, tzinfo=UTC)
 KEY = "fleet/@bus/whoami/g1"

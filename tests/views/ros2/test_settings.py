@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from zbridge.app.toml import convert
 from zbridge.errors import ConfigError
+from zbridge.toml import convert
 from zbridge.views.ros2.settings import Body, File, Options, plan
 
 FILE = {

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from zbridge.app.toml import read_toml
+from zbridge.toml import read_toml
 
 _SECRET = re.compile(r"pass|secret|token|key|credential|private|auth", re.IGNORECASE)
 _IN_ADDRESS = re.compile(r"(?<=//)[^/@\s]*@")

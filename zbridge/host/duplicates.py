@@ -1,0 +1,210 @@
+"""The supervisor's duplicates of the sockets to one robot, and the stop that is written over them.
+
+A duplicate keeps a connection open although the process that made it is dead. It must be closed when that process
+closes its own on purpose: until then the robot sees no end of the connection.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import socket
+import stat
+from collections.abc import Sequence
+
+from zbridge.host.fd_channel import close_all
+from zbridge.host.memory import SLOTS
+from zbridge.host.state import LinkState
+from zbridge.robot.observer import Boundary, LastStop
+
+log = logging.getLogger("zbridge.host")
+
+TIMES = 4
+"""So often a stop is written: deployed robots lose what they read together with something else."""
+PERIOD_S = 0.12
+"""Seconds between two stops."""
+LEAVE_S = 0.5
+"""Longest time for which a connection is read empty before it is closed."""
+_READS, _READ_BYTES = 32, 65_536
+"""How much is read away at a time."""
+
+
+class Duplicate:
+    """The sockets of one link: its stream, and its datagrams where there are any."""
+
+    def __init__(self, name: str, *, drives: bool) -> None:
+        self.name = name
+        self.drives = drives
+        self.boundary = Boundary()
+        self._stream: int | None = None
+        self._datagrams: int | None = None
+
+    def __repr__(self) -> str:
+        return f"<Duplicate {self.name}>"
+
+    @classmethod
+    def of(cls, state: LinkState) -> Duplicate:
+        """Make one of descriptors that are open already."""
+        duplicate = cls(state.name, drives=state.drives)
+        duplicate.boundary, duplicate._stream, duplicate._datagrams = state.boundary, state.stream, state.datagrams
+        return duplicate
+
+    def state(self, link: int) -> LinkState:
+        """Give what :meth:`of` needs; ``link``: its number."""
+        return LinkState(link, self.name, self.drives, self.boundary, self._stream, self._datagrams)
+
+    def take(self, descriptors: Sequence[int]) -> None:
+        """Keep descriptors: the stream's first, then the one of datagrams; those before are closed."""
+        self.close()
+        self._stream, self._datagrams = (*descriptors, None, None)[:2]
+        close_all(descriptors[2:])
+
+    def descriptor(self, at: int) -> int | None:
+        """Give the stream's descriptor (0), or that of datagrams (1)."""
+        return (self._stream, self._datagrams)[at] if at in (0, 1) else None
+
+    def close(self) -> None:
+        """Close the duplicates; idempotent."""
+        close_all([number for number in (self._stream, self._datagrams) if number is not None])
+        self._stream = self._datagrams = None
+
+    def read_away(self) -> None:
+        """Read what waits, and forget it."""
+        if self._stream is not None and stat.S_ISSOCK(os.fstat(self._stream).st_mode):
+            with _borrowed(self._stream) as stream, contextlib.suppress(OSError):
+                for _ in range(_READS):
+                    stream.recv(_READ_BYTES, socket.MSG_DONTWAIT)
+
+    async def stop(self, last: LastStop, times: int) -> bool:
+        """Write the stop so often; False where the link takes nothing.
+
+        The first frame waits for one gap: the dead process may have written a moment ago.
+        """
+        for time in range(times):
+            if time:
+                await asyncio.sleep(PERIOD_S)
+            for frame in last.frames:
+                await asyncio.sleep(last.gap_s)
+                if not self._write(frame.data, datagram=frame.datagram):
+                    return False
+        return True
+
+    def _write(self, data: bytes, *, datagram: bool) -> bool:
+        stream = self._stream
+        if stream is None or not self.boundary.outgoing:
+            return False
+        try:
+            if datagram:
+                return self._send_datagram(stream, data)
+            return os.write(stream, data) == len(data)
+        except OSError as error:
+            log.debug("%s: no stop written: %s", self.name, error)
+            return False
+
+    def _send_datagram(self, stream: int, data: bytes) -> bool:
+        """Send to where the stream leads: a robot takes datagrams at the same address and port."""
+        if self._datagrams is None:
+            return False
+        with _borrowed(stream) as robot, _borrowed(self._datagrams) as own:
+            return own.sendto(data, socket.MSG_DONTWAIT, robot.getpeername()) == len(data)
+
+
+class _borrowed:  # noqa: N801 - reads as a function
+    """A socket object for a descriptor that stays open."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+
+    def __enter__(self) -> socket.socket:
+        self._socket = socket.socket(fileno=self._descriptor)
+        return self._socket
+
+    def __exit__(self, *_: object) -> None:
+        self._socket.detach()
+
+
+class Duplicates:
+    """The duplicates of one process, by the numbers that it gives its links."""
+
+    def __init__(self) -> None:
+        self._links: dict[int, Duplicate] = {}
+
+    def __repr__(self) -> str:
+        return f"<Duplicates {sorted(self._links)}>"
+
+    def __len__(self) -> int:
+        return len(self._links)
+
+    @property
+    def state(self) -> tuple[LinkState, ...]:
+        """The descriptors and where the streams stand, for :meth:`resume`."""
+        return tuple(duplicate.state(link) for link, duplicate in self._links.items())
+
+    def resume(self, links: Sequence[LinkState]) -> None:
+        """Go on with descriptors that are open already."""
+        self._links.update({each.link: Duplicate.of(each) for each in links})
+
+    def opened(self, link: int, name: str, descriptors: Sequence[int], *, drives: bool) -> None:
+        """Keep the descriptors of a link; too many links, and what is no socket or line, are closed at once."""
+        if len(self._links) >= SLOTS or not descriptors or not all(map(_is_link, descriptors)):
+            close_all(descriptors)
+            return
+        self._links.setdefault(link, Duplicate(name, drives=drives)).take(descriptors)
+
+    def name(self, link: int) -> str | None:
+        """Give the name of a link; None where there is none of this number."""
+        return self._links[link].name if link in self._links else None
+
+    def named(self, name: str) -> int | None:
+        """Give the number of the newest link of this name."""
+        return next((link for link, each in reversed(self._links.items()) if each.name == name), None)
+
+    def descriptor(self, link: int, at: int) -> int | None:
+        """Give a descriptor of a link: 0 its stream's, 1 that of datagrams; None where there is none, or half a frame
+        was written.
+        """
+        duplicate = self._links.get(link)
+        return duplicate.descriptor(at) if duplicate is not None and duplicate.boundary.outgoing else None
+
+    def stands(self, streams: dict[int, Boundary]) -> None:
+        """Note where the streams stand."""
+        for link, boundary in streams.items():
+            if link in self._links:
+                self._links[link].boundary = boundary
+
+    def closed(self, link: int) -> None:
+        """Close the duplicates of a link at once."""
+        if link in self._links:
+            self._links.pop(link).close()
+
+    def close(self) -> None:
+        """Close all duplicates; idempotent."""
+        while self._links:
+            self._links.popitem()[1].close()
+
+    async def leave(self) -> None:
+        """Close all, but first let the robot read its stop: the kernel would reset what is closed with bytes unread.
+
+        A robot whose own sending is held up goes on when that is read.
+        """
+        loop = asyncio.get_running_loop()
+        ends_at = loop.time() + LEAVE_S
+        while self._links and loop.time() < ends_at:
+            for duplicate in self._links.values():
+                duplicate.read_away()
+            await asyncio.sleep(LEAVE_S / 25)
+        self.close()
+
+    async def stop(self, last: LastStop, times: int = TIMES) -> bool | None:
+        """Write the robot's stop so often; whether its link took it, None where there is no link or no stop."""
+        driving = [link for link in self._links.values() if link.drives]
+        if not driving or not last.frames:
+            return None
+        return await driving[-1].stop(last, times)
+
+
+def _is_link(descriptor: int) -> bool:
+    mode = os.fstat(descriptor).st_mode
+    return stat.S_ISSOCK(mode) or stat.S_ISCHR(mode)

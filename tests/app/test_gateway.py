@@ -19,7 +19,7 @@ from tests.clock import jumping
 from tests.proofs import Holder
 from zbridge.app.config import plan
 from zbridge.app.gateway import Gateway
-from zbridge.app.handover.messages import VERSION, Given
+from zbridge.app.handover.channel import VERSION, Given
 from zbridge.app.joining import RETRY_S, join_bus
 from zbridge.app.tasks import until_signal
 from zbridge.bus import Bus, Handle

@@ -16,8 +16,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from zbridge.app.handover.channel import Channel
-from zbridge.app.handover.messages import Given, Go, Hello, Message, Up
+from zbridge.app.handover.channel import Channel, Given, Go, Hello, Message, Up
 from zbridge.app.handover.processes import PROCESSES
 from zbridge.protocol.session import Role
 from zbridge.transport import Conversation, Parcel

@@ -19,8 +19,7 @@ from tests.access import COLUMNS, LAB, Try, granted_by_the_code, table
 from tests.certificates import Authority
 from tests.e2e.conftest import until
 from tests.e2e.secure import FAR, GRACE_S, ROLES, Matrix, SecureBus, declared, ignore, secure, text
-from zbridge.security.access import Column
-from zbridge.security.access_rules import STOPS_HZ
+from zbridge.security.access import STOPS_HZ, Column
 from zbridge.security.roles import Roles
 
 PAGE = Path(__file__).parents[2] / "docs" / "security.md"

@@ -19,7 +19,7 @@ from tests.e2e.processes import ROOT
 from tests.e2e.restarts import MOST_GAP_S, ROBOTS, Restarted, restart
 from tests.e2e.robots import MOVE, STOP, Robot
 from tests.ports import free_port
-from zbridge.app.handover.messages import VERSION
+from zbridge.app.handover.channel import VERSION
 
 
 @pytest.mark.parametrize("protocol", ROBOTS)
@@ -130,7 +130,7 @@ def test_a_successor_that_finds_a_bad_file_leaves_the_gateway_as_it_was(bench: B
 FAKE = """
 import os, socket, sys, time
 sys.path.insert(0, {root!r})
-from zbridge.app.handover import messages
+from zbridge.app.handover import channel as messages
 from zbridge.app.handover.channel import Channel
 descriptor = int(sys.argv[sys.argv.index("--take-over") + 1])
 channel = Channel(socket.socket(fileno=descriptor))
@@ -164,9 +164,9 @@ def test_a_broken_successor_is_ended_and_the_gateway_goes_on(
     patched = bench.folder / "patched.py"
     patched.write_text(
         f"import sys; sys.path.insert(0, {str(ROOT)!r})\n"
-        "from zbridge.app.handover import outgoing, successor\n"
+        "from zbridge.app.handover import outgoing, processes\n"
         f"outgoing.START_S, outgoing.TAKE_OVER_S = {1.0 if how == 'silent' else 20.0}, 0.5\n"
-        f"successor.COMMAND = [sys.executable, {str(broken)!r}]\n"
+        f"processes.COMMAND = [sys.executable, {str(broken)!r}]\n"
         "from zbridge.cli import main\n"
         "main()\n"
     )

@@ -10,14 +10,14 @@ import msgspec
 
 from tests.fleet.test_payload import PAYLOADS
 from tests.fuzz.target import Target, comparable, require_same
-from zbridge.app.handover import messages as handover
+from zbridge.app.handover import channel as handover
 from zbridge.control.gate import is_stop
 from zbridge.control.latch import STOPS, Latches, LatchRecord, latch_of, read_stop
 from zbridge.control.proof import Verifier, read
 from zbridge.errors import LinkError, Malformed, PayloadError, ProtocolError, Unsupported
 from zbridge.fleet import messages, payload, topics
 from zbridge.fleet.messages import Authorization, FleetMessage, Stop
-from zbridge.host import messages as supervisor
+from zbridge.host import fd_channel as supervisor
 from zbridge.protocol.address import Address, parse_device_address
 from zbridge.protocol.samples import KeyedSample, SampleKind, read_sample, write_sample
 from zbridge.robot import ownership

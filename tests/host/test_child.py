@@ -9,23 +9,24 @@ from collections.abc import AsyncIterator, Iterator
 import msgspec
 import pytest
 
-from zbridge.app.handover.messages import VERSION, Given
+from zbridge.app.handover.channel import VERSION, Given
 from zbridge.errors import HandoverError
 from zbridge.host import child
 from zbridge.host.child import Reporter
-from zbridge.host.fd_channel import Post, close_all
-from zbridge.host.memory import DEPOSIT_BYTES, SLOTS, MemoryReader
-from zbridge.host.messages import (
+from zbridge.host.fd_channel import (
     Beat,
     Closed,
     Kept,
     Message,
     Opened,
+    Post,
     Shared,
     Started,
     Succeeded,
     WantSuccessor,
+    close_all,
 )
+from zbridge.host.memory import DEPOSIT_BYTES, SLOTS, MemoryReader
 from zbridge.protocol.kept import Budget
 from zbridge.robot.observer import Boundary, LastStop, StopFrame
 from zbridge.transport import Parcel

@@ -9,12 +9,12 @@ from collections.abc import Iterator
 import msgspec
 import pytest
 
-from zbridge.app.handover.messages import VERSION, Given
+from zbridge.app.handover.channel import VERSION, Given
 from zbridge.errors import HandoverError
 from zbridge.host import duplicates
 from zbridge.host.deposit import Deposit
+from zbridge.host.fd_channel import Kept
 from zbridge.host.memory import MemoryWriter
-from zbridge.host.messages import Kept
 from zbridge.robot.observer import Boundary, LastStop, StopFrame
 from zbridge.wire.frames import Partial
 

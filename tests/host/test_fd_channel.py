@@ -7,9 +7,20 @@ from collections.abc import Iterator
 
 import pytest
 
-from zbridge.host.fd_channel import Post, close_all
-from zbridge.host.messages import Beat, Closed, Fork, Forked, Message, Opened, Ready, Started, Succeeded
-from zbridge.host.messages import WantSuccessor as Want
+from zbridge.host.fd_channel import (
+    Beat,
+    Closed,
+    Fork,
+    Forked,
+    Message,
+    Opened,
+    Post,
+    Ready,
+    Started,
+    Succeeded,
+    close_all,
+)
+from zbridge.host.fd_channel import WantSuccessor as Want
 from zbridge.robot.observer import Boundary, LastStop, StopFrame
 
 STOP = LastStop(driven=True, frames=(StopFrame(b"\x01"), StopFrame(b"\x02", True)), gap_s=0.1, state="established")

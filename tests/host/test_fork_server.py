@@ -10,10 +10,8 @@ import pytest
 
 from zbridge.errors import NotReady
 from zbridge.host import forks as module
-from zbridge.host.fd_channel import Post
-from zbridge.host.forks import Forks, fork_server_command
-from zbridge.host.installation import Stamp
-from zbridge.host.messages import Fork
+from zbridge.host.fd_channel import Fork, Post
+from zbridge.host.forks import Forks, Stamp, fork_server_command
 from zbridge.host.supervisor import _become_reaper
 
 SOON_S = 30.0
@@ -145,7 +143,7 @@ async def test_a_changed_installation_gets_a_server_of_its_own_and_a_broken_one_
 
 
 def test_the_stamp_of_an_installation_changes_with_its_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from zbridge.host import installation
+    from zbridge.host import forks as installation
 
     monkeypatch.setattr(installation, "HOME", tmp_path)
     source = tmp_path / "code.py"

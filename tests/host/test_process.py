@@ -12,10 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from zbridge.host.fd_channel import Post
+from zbridge.host.fd_channel import Beat, Kept, Opened, Post, Shared, Started, Succeeded, WantSuccessor
 from zbridge.host.files import RobotFile
 from zbridge.host.memory import MemoryWriter
-from zbridge.host.messages import Beat, Kept, Opened, Shared, Started, Succeeded, WantSuccessor
 from zbridge.host.process import GatewayProcess
 from zbridge.robot.observer import LastStop
 

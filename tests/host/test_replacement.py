@@ -18,24 +18,24 @@ from zbridge.errors import HandoverError
 from zbridge.host import replacement
 from zbridge.host import supervisor as module
 from zbridge.host.deposit import Deposit
-from zbridge.host.fd_channel import Post
+from zbridge.host.fd_channel import Beat, Kept, Opened, Post, Shared
 from zbridge.host.files import Changes, RobotFile
-from zbridge.host.forks import SIGNALS, Forks
+from zbridge.host.forks import Forks
 from zbridge.host.memory import MemoryWriter
-from zbridge.host.messages import Beat, Kept, Opened, Shared
 from zbridge.host.process import GatewayProcess
-from zbridge.host.replacement import replace
-from zbridge.host.runner import Runner
-from zbridge.host.settings import HostSettings
-from zbridge.host.state import (
+from zbridge.host.replacement import (
+    SIGNALS,
     VERSION,
     ProcessState,
     RunnerState,
     ServerState,
     SupervisorState,
+    replace,
     restore,
     store,
 )
+from zbridge.host.runner import Runner
+from zbridge.host.settings import HostSettings
 from zbridge.host.supervisor import Supervisor
 from zbridge.host.watchdog import DRIVEN_S, EXCUSED_S, Heart, HeartState
 from zbridge.robot.observer import Boundary, LastStop, StopFrame
@@ -235,7 +235,7 @@ async def test_a_resumed_runner_waits_for_its_next_process_until_the_same_time()
 
 # The replacement
 
-READS = "import sys; from zbridge.host.state import restore; restore(int(sys.argv[-1]))"
+READS = "import sys; from zbridge.host.replacement import restore; restore(int(sys.argv[-1]))"
 
 
 def python(code: str) -> list[str]:

@@ -13,15 +13,13 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from zbridge.app.handover.channel import Channel, EndError
-from zbridge.app.handover.messages import VERSION, Given, Go, Hello, Up
+from zbridge.app.handover.channel import VERSION, Channel, EndError, Given, Go, Hello, Up
 from zbridge.errors import NotReady
 from zbridge.host import duplicates, succession
 from zbridge.host import runner as module
-from zbridge.host.fd_channel import Post
+from zbridge.host.fd_channel import Beat, Kept, Opened, Post, Shared, Started, Succeeded, WantSuccessor
 from zbridge.host.files import RobotFile, check
 from zbridge.host.memory import MemoryWriter
-from zbridge.host.messages import Beat, Kept, Opened, Shared, Started, Succeeded, WantSuccessor
 from zbridge.host.process import GatewayProcess
 from zbridge.host.runner import KEPT_CRASHES, Runner
 from zbridge.robot.observer import LastStop, StopFrame

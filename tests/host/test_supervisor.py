@@ -13,8 +13,8 @@ import pytest
 from zbridge.errors import ConfigError
 from zbridge.host import supervisor as module
 from zbridge.host.files import Changes, RobotFile
+from zbridge.host.replacement import VERSION, RunnerState
 from zbridge.host.settings import HostSettings
-from zbridge.host.state import VERSION, RunnerState
 from zbridge.host.supervisor import LATE_S, READY_S, STATUS_S, Supervisor
 from zbridge.host.watchdog import DRIVEN_S, EXCUSED_S, IDLE_S, Heart
 
@@ -87,7 +87,7 @@ class Systemd:
         self.hears = True
         self.watchdog_s = 0.0
 
-    def tell(self, *lines: str) -> bool:
+    def notify(self, *lines: str) -> bool:
         self.told += lines if self.hears else ()
         return self.hears
 

@@ -10,8 +10,7 @@ from collections import deque
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from tests.simulated.engine import THREAD_S, Process
-from zbridge.app.handover.channel import Channel
-from zbridge.app.handover.messages import Go, Message
+from zbridge.app.handover.channel import Channel, Go, Message
 from zbridge.app.handover.processes import Processes
 from zbridge.errors import HandoverError
 from zbridge.transport import Parcel

@@ -18,12 +18,11 @@ from typing import Any
 
 import msgspec
 
-from zbridge.app.audit import open_audit
 from zbridge.app.config import Plan
 from zbridge.app.handover import ClaimPart, Incoming, Restarts, Successor
 from zbridge.app.joining import CertificateEnded, watch_certificate
 from zbridge.app.prometheus import serve_metrics
-from zbridge.app.runtime import RUNTIME, Runtime
+from zbridge.app.runtime import RUNTIME, Runtime, open_audit
 from zbridge.app.serving import SERVED_ELSEWHERE, Begin, Serving
 from zbridge.app.tasks import together, until
 from zbridge.bus import Bus, Handle, IncomingQuery

@@ -117,7 +117,7 @@ def run_gateway(
     except ConfigError as error:
         raise ConfigError(f"{file}: {error}") from error
     if gateway.restarts.gone.is_set() and isinstance(successor, Spawn):
-        successor.tell_systemd()
+        successor.notify_systemd()
     if not gateway.left:  # a thread of the bus hangs and would keep the process alive
         logging.shutdown()
         os._exit(0)

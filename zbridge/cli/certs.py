@@ -17,9 +17,8 @@ from zbridge.fleet.printable import as_json, shown
 from zbridge.security.roles import OF_ROBOTS, ROLES, Member, load_roles
 
 if TYPE_CHECKING:
-    from zbridge.security.certs.authority import Issued
+    from zbridge.security.certs.authority import Entry, Issued
     from zbridge.security.certs.files import Folder
-    from zbridge.security.certs.listing import Entry
 
 app = typer.Typer(
     help="Make the certificates of a secure bus: an authority, and one certificate for each name.",
@@ -122,9 +121,9 @@ def list_names(
 ) -> None:
     """List the names: role, robots, hosts, expiry, fingerprint, and what is wrong."""
     folder = opened(directory)
-    from zbridge.security.certs import listing
+    from zbridge.security.certs import authority
 
-    entries = listing.list_names(folder, now())
+    entries = authority.list_names(folder, now())
     if json:
         for entry in entries:
             say(as_json(_fields(entry)))

@@ -14,8 +14,7 @@ from zbridge.bus.tls.files import folder_tls
 from zbridge.cli import run_loop
 from zbridge.errors import ConfigError
 from zbridge.security.router import Router, ZenohWarnings
-from zbridge.security.router_firewall import nftables
-from zbridge.security.router_settings import RouterSettings, load_router, nested, plan_router, zenoh_values
+from zbridge.security.router_settings import RouterSettings, load_router, nested, nftables, plan_router, zenoh_values
 from zbridge.toml import convert
 
 RUNTIME = "(rx: (worker_threads: 2), acc: (worker_threads: 1))"

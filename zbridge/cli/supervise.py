@@ -11,8 +11,8 @@ from zbridge.app import until_signal
 from zbridge.cli import set_up_log
 from zbridge.errors import ConfigError
 from zbridge.host.forks import fork_server_command, module_command
+from zbridge.host.replacement import restore
 from zbridge.host.settings import HostSettings, load_host
-from zbridge.host.state import restore
 from zbridge.host.supervisor import Supervisor
 
 

@@ -23,20 +23,21 @@ from functools import partial
 
 import msgspec
 
-from zbridge.app.handover.messages import Given
+from zbridge.app.handover.channel import Given
 from zbridge.errors import HandoverError, describe
-from zbridge.host.fd_channel import Post, close_all
-from zbridge.host.memory import DEPOSIT_BYTES, PARTIAL_BYTES, SLOTS, MemoryWriter, slot_of
-from zbridge.host.messages import (
+from zbridge.host.fd_channel import (
     Beat,
     Closed,
     Kept,
     Opened,
+    Post,
     Shared,
     Started,
     Succeeded,
     WantSuccessor,
+    close_all,
 )
+from zbridge.host.memory import DEPOSIT_BYTES, PARTIAL_BYTES, SLOTS, MemoryWriter, slot_of
 from zbridge.protocol.kept import Budget
 from zbridge.robot.observer import LastStop, Observed, Resume
 from zbridge.transport import Link, Parcel

@@ -11,11 +11,11 @@ import os
 
 import msgspec
 
-from zbridge.app.handover.messages import Given
+from zbridge.app.handover.channel import Given
 from zbridge.errors import HandoverError
 from zbridge.host.duplicates import Duplicates
+from zbridge.host.fd_channel import Kept
 from zbridge.host.memory import MemoryReader
-from zbridge.host.messages import Kept
 from zbridge.robot.observer import LastStop
 from zbridge.transport import Parcel
 from zbridge.wire.frames import Partial

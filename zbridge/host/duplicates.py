@@ -16,7 +16,7 @@ from collections.abc import Sequence
 
 from zbridge.host.fd_channel import close_all
 from zbridge.host.memory import SLOTS
-from zbridge.host.state import LinkState
+from zbridge.host.replacement import LinkState
 from zbridge.robot.observer import Boundary, LastStop
 
 log = logging.getLogger("zbridge.host")

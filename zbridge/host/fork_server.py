@@ -25,8 +25,7 @@ from typing import NoReturn
 import msgspec
 
 from zbridge.app.config import plan
-from zbridge.host.fd_channel import Post, close_all
-from zbridge.host.messages import Fork, Forked, Ready
+from zbridge.host.fd_channel import Fork, Forked, Post, Ready, close_all
 from zbridge.protocol.plugin import find_protocol, protocol_names
 
 IMPORTED = ("numpy", "uvloop", "serial", "encodings.idna", "zbridge.bus.zenoh", "zbridge.app.gateway")

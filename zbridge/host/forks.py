@@ -1,9 +1,10 @@
-"""The supervisor's side of its fork server: starts it, asks it, and replaces it when the installation has changed."""
+"""The supervisor's side of its fork server: starts it, asks it, and replaces it when the installed code has changed."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import hashlib
 import logging
 import math
 import os
@@ -11,18 +12,22 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from importlib.util import find_spec
 from pathlib import Path
 
 from zbridge.errors import NotReady
-from zbridge.host.fd_channel import Post, close_all
-from zbridge.host.installation import HOME, Stamp
-from zbridge.host.messages import Fork, Forked, Message, Ready
-from zbridge.host.state import ServerState
+from zbridge.host.fd_channel import Fork, Forked, Message, Post, Ready, close_all
+from zbridge.host.replacement import NOT_INHERITED, ServerState
+from zbridge.protocol.plugin import GROUP
 
 log = logging.getLogger("zbridge.host")
 
+HOME = Path(__file__).parents[1]
+"""The folder of zbridge's code."""
+SETTLED_S = 2.0
+"""Seconds for which nothing must have changed: an installer writes file after file."""
 READY_S = 60.0
 """Longest time in which a fork server imports everything."""
 LOOK_S = 2.0
@@ -31,11 +36,54 @@ FORK_S = 10.0
 """Longest time for one fork."""
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 """What numpy's libraries must be told, before they are loaded, to start no threads."""
-SIGNALS = (signal.SIGHUP, signal.SIGUSR2, signal.SIGTERM, signal.SIGINT)
-"""What a supervisor is told by signals."""
-THREADS = 64
-"""Most threads of a supervisor that wait at a time: for files, and for successors of gateways that died together."""
-NOT_INHERITED = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
+
+
+class Stamp:
+    """What is installed now. Two stamps are equal if no file of the code differs in size and time of change."""
+
+    def __init__(self) -> None:
+        digest, newest_ns = hashlib.blake2b(digest_size=16), 0
+        for path in _files():
+            try:
+                state = path.stat()
+            except OSError:  # an installer replaces it at this moment
+                newest_ns = time.time_ns()
+                continue
+            digest.update(f"{path}\0{state.st_size}\0{state.st_mtime_ns}\0".encode())
+            newest_ns = max(newest_ns, state.st_mtime_ns, state.st_ctime_ns)
+        self.digest = digest.digest()
+        self.settled = abs(time.time_ns() - newest_ns) > SETTLED_S * 1e9
+        """Whether nothing changed for :data:`SETTLED_S`."""
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Stamp) and self.digest == other.digest
+
+    @classmethod
+    def of(cls, digest: bytes) -> Stamp:
+        """Make the stamp of an installation that was looked at before."""
+        stamp = cls.__new__(cls)
+        stamp.digest, stamp.settled = digest, True
+        return stamp
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        return f"<Stamp {self.digest.hex()[:8]}>"
+
+
+def _files() -> list[Path]:
+    """List the code of zbridge and of the protocols, and the names of what is installed beside it."""
+    roots = {HOME, *_protocol_packages()}
+    sources = [path for root in roots for path in root.rglob("*.py")]
+    return sorted({*sources, *(path for folder in sys.path for path in Path(folder).glob("*.dist-info"))})
+
+
+def _protocol_packages() -> set[Path]:
+    """Find the folders of the protocols' packages; loads none of them."""
+    from importlib.metadata import entry_points
+
+    specs = [find_spec(point.module.partition(".")[0]) for point in entry_points(group=GROUP)]
+    return {Path(spec.origin).parent for spec in specs if spec is not None and spec.has_location and spec.origin}
 
 
 class _Adopted:
@@ -292,11 +340,6 @@ def _in_memory(content: bytes) -> Iterator[int]:
         yield descriptor
     finally:
         os.close(descriptor)
-
-
-def quiet_threads() -> ThreadPoolExecutor:
-    """Make threads that take no signals of the process: they would be lost at its exec. Many may wait at a time."""
-    return ThreadPoolExecutor(THREADS, "zbridge", lambda: signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS))
 
 
 async def _started(command: Sequence[str], stamp: Stamp) -> _Server:

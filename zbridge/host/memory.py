@@ -8,7 +8,7 @@ frame (:class:`Partial`). A process that dies while a slot is ``READING`` has ta
 was never touched belongs to a link of which this process has read nothing.
 
 A **deposit** is what a successor needs. The process writes it to the area that is not in use, and then tells which
-area counts (:class:`zbridge.host.messages.Kept`). So a process that dies while it writes leaves the one
+area counts (:class:`zbridge.host.fd_channel.Kept`). So a process that dies while it writes leaves the one
 before.
 """
 

@@ -12,20 +12,21 @@ import time
 from collections.abc import Callable
 
 from zbridge.host.deposit import Deposit
-from zbridge.host.fd_channel import Post, close_all
-from zbridge.host.files import RobotFile
-from zbridge.host.messages import (
+from zbridge.host.fd_channel import (
     Beat,
     Closed,
     FromGateway,
     Kept,
     Opened,
+    Post,
     Shared,
     Started,
     Succeeded,
     WantSuccessor,
+    close_all,
 )
-from zbridge.host.state import ProcessState
+from zbridge.host.files import RobotFile
+from zbridge.host.replacement import ProcessState
 from zbridge.host.watchdog import Heart
 from zbridge.robot.observer import LastStop
 

@@ -10,7 +10,7 @@ is not possible, or the third in a row has crashed, the connection is closed, an
 that :class:`BackOff` gives.
 
 **A restart.** The process asks for a successor, and hands everything over to it. It says so
-(:class:`~zbridge.host.messages.Succeeded`) before it tells the successor. That message decides:
+(:class:`~zbridge.host.fd_channel.Succeeded`) before it tells the successor. That message decides:
 
 =========================  =========================================================================================
 who dies, when             what happens
@@ -38,15 +38,14 @@ import msgspec
 
 from zbridge.app.tasks import Background
 from zbridge.errors import HandoverError, NotReady
-from zbridge.host.back_off import HEALTHY_S, BackOff
 from zbridge.host.duplicates import PERIOD_S, TIMES
 from zbridge.host.fd_channel import Post
 from zbridge.host.files import RobotFile
 from zbridge.host.forks import Forks
-from zbridge.host.launch import Launcher
 from zbridge.host.process import KILLED_S, GatewayProcess
-from zbridge.host.state import RunnerState
-from zbridge.host.succession import GONE_S, Succession
+from zbridge.host.replacement import RunnerState
+from zbridge.host.succession import GONE_S, Launcher, Succession
+from zbridge.host.watchdog import HEALTHY_S, BackOff
 from zbridge.toml import FILE_BYTES
 
 log = logging.getLogger("zbridge.host")

@@ -18,17 +18,23 @@ from pathlib import Path
 
 import msgspec
 
-from zbridge.app.handover.channel import Channel
-from zbridge.app.handover.messages import Given, Go, Hello, Up
+from zbridge.app.handover.channel import Channel, Given, Go, Hello, Up
 from zbridge.errors import HandoverError, NotReady
 from zbridge.host.duplicates import PERIOD_S
+from zbridge.host.fd_channel import Fork, Post, Started
 from zbridge.host.files import RobotFile, read
-from zbridge.host.launch import Launcher
-from zbridge.host.messages import Started
+from zbridge.host.forks import Forks
 from zbridge.host.process import GatewayProcess
 from zbridge.transport import Parcel
 
 log = logging.getLogger("zbridge.host")
+
+
+STAT_S = 1.0
+"""Longest wait for the disk to tell whether a robot file is still there."""
+
+Make = Callable[[int, Post, RobotFile], GatewayProcess]
+"""``make(pid, post, file)``: the process as its runner knows it."""
 
 START_S = 10.0
 """Longest time until a successor has joined the bus."""
@@ -36,6 +42,47 @@ TAKE_OVER_S = 5.0
 """Longest time until it has taken over what was offered."""
 GONE_S = 2.0
 """Longest wait for the end of a process that was killed."""
+
+
+class Launcher:
+    """Starts processes; ``make`` makes of each what its runner knows."""
+
+    def __init__(self, forks: Forks, make: Make, *, verbose: bool) -> None:
+        self._forks = forks
+        self._make = make
+        self._verbose = verbose
+
+    def __repr__(self) -> str:
+        return f"<Launcher by {self._forks!r}>"
+
+    async def start(self, file: RobotFile, take_over: int | None = None, *, at_once: bool = False) -> GatewayProcess:
+        """Fork a process; raise NotReady with the reason: also that the file is gone, whatever stood in it.
+
+        take_over: descriptor of the socket by which it takes over. at_once: without a look at the installation.
+        """
+        if not await _is_there(file.path):
+            raise NotReady(f"{file.path} is gone")
+        try:
+            post, far = Post.pair()
+        except OSError as error:
+            raise NotReady(error.strerror or str(error)) from error
+        request = Fork(str(file.path), file.robot, self._verbose)
+        try:
+            with far:
+                pid = await self._forks.fork(request, far, file.content, take_over, at_once=at_once)
+        except NotReady:
+            post.close()
+            raise
+        log.info("%s: process %d", file.robot, pid)
+        return self._make(pid, post, file)
+
+
+async def _is_there(path: Path) -> bool:
+    """Whether a file is there, as far as the disk tells in time."""
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(STAT_S):
+            return await asyncio.to_thread(path.exists)
+    return True
 
 
 class Succession:

@@ -22,17 +22,15 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from zbridge.app.handover.processes import Systemd
 from zbridge.app.tasks import Background
 from zbridge.errors import ConfigError, HandoverError, NotReady
 from zbridge.host.files import Changes, Follower, RobotFile, compare, first_look
-from zbridge.host.forks import Forks, quiet_threads
-from zbridge.host.installation import Stamp
-from zbridge.host.notify import Systemd
+from zbridge.host.forks import Forks, Stamp
 from zbridge.host.process import GatewayProcess
-from zbridge.host.replacement import release_signals, replace
+from zbridge.host.replacement import VERSION, SupervisorState, quiet_threads, release_signals, replace
 from zbridge.host.runner import Runner
 from zbridge.host.settings import HostSettings
-from zbridge.host.state import VERSION, SupervisorState
 
 log = logging.getLogger("zbridge.host")
 
@@ -142,7 +140,7 @@ class Supervisor:
 
     async def _end(self) -> None:
         self._ends = True
-        self._systemd.tell("STOPPING=1", f"STATUS=ending {len(self._runners)} gateways")
+        self._systemd.notify("STOPPING=1", f"STATUS=ending {len(self._runners)} gateways")
         await asyncio.gather(*(runner.end() for runner in (*self._runners.values(), *self._leaving)))
         await self._running.cancel()
         for timer in (self._timer, self._told):
@@ -161,7 +159,7 @@ class Supervisor:
             asked = self._reload.is_set()
             self._reload.clear()
             if asked:
-                self._systemd.tell("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
+                self._systemd.notify("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
             try:
                 if asked or self._watch:
                     running = {path: runner.file for path, runner in self._runners.items()}
@@ -170,7 +168,7 @@ class Supervisor:
             except (ConfigError, NotReady) as error:
                 log.error("%s", error)
             if asked:
-                self._systemd.tell("READY=1")
+                self._systemd.notify("READY=1")
             await self._follow_code(asked=asked)
 
     async def _apply(self, changes: Changes, *, first: bool = False) -> None:
@@ -298,7 +296,7 @@ class Supervisor:
     async def _live(self) -> None:
         """Give systemd signs of life, where it wants them."""
         while self._systemd.watchdog_s:
-            self._systemd.tell("WATCHDOG=1")
+            self._systemd.notify("WATCHDOG=1")
             await asyncio.sleep(self._systemd.watchdog_s)
 
     def _state_changed(self) -> None:
@@ -310,7 +308,7 @@ class Supervisor:
         self._told = None
         beaten = all(runner.process is not None and runner.process.heart.beats for runner in self._runners.values())
         ready = ("READY=1",) if beaten and self._all_started and not self._is_ready else ()
-        if not self._systemd.tell(*ready, f"STATUS={self.status}"):
+        if not self._systemd.notify(*ready, f"STATUS={self.status}"):
             self._state_changed()  # again, later
         elif ready:
             self._is_ready = True

@@ -1,11 +1,22 @@
-"""Decides when a gateway process counts as hung. Sans-IO: time is an argument, in seconds.
+"""Decides when a gateway process counts as hung, and when one that died is started again.
 
-A robot that moves when its gateway hangs has to rest within 1.5 s: a driven process is given 0.8 s without a beat (it
-beats five times a second), which leaves 0.7 s for a busy machine and the stop. Where the machine held up the supervisor
-itself, the beats may be late for the same reason, and get a little longer.
+Sans-IO: time is an argument, in seconds. A robot that moves when its gateway hangs has to stop within 1.5 s: a driven
+process is allowed 0.8 s without a heartbeat (it sends five a second), which leaves 0.7 s for a busy machine and the
+stop. If the machine delayed the supervisor itself, the heartbeats may be late for the same reason, and get a little
+longer.
+
+The delay before a restart, with jitter (each time times 0.8 to 1.2)::
+
+    failure   1     2     3     4    5    6 and on
+    delay     0.25  0.5   1     2    4    60 s
+
+A process that lived for :data:`HEALTHY_S` counts as the first failure again.
 """
 
 from __future__ import annotations
+
+import random
+from collections.abc import Callable
 
 import msgspec
 
@@ -17,6 +28,12 @@ FIRST_S = 30.0
 """Longest time until the first beat: thirty processes that start at once share the processors."""
 EXCUSED_S = 0.2
 """What is added for a supervisor that was held up itself."""
+FIRST_DELAY_S = 0.25
+QUICK_RESTARTS = 5
+"""Failures in a row that are answered soon."""
+LONG_DELAY_S = 60.0
+HEALTHY_S = 60.0
+JITTER = 0.2
 
 
 class HeartState(msgspec.Struct, frozen=True):
@@ -70,3 +87,24 @@ class Heart:
     def silent_s(self, now: float) -> float:
         """Give the seconds since the last beat."""
         return now - self._last
+
+
+class BackOff:
+    """The failures of one process in a row. chance: gives a number from 0 to 1."""
+
+    def __init__(self, chance: Callable[[], float] = random.random) -> None:
+        self.failures = 0
+        self._chance = chance
+
+    def __repr__(self) -> str:
+        return f"<BackOff after {self.failures} failures>"
+
+    def failed(self, lived_s: float) -> float:
+        """Note a failure after so many seconds of life; return the seconds until the next start."""
+        self.failures = 1 if lived_s >= HEALTHY_S else self.failures + 1
+        base_s = FIRST_DELAY_S * 2 ** (self.failures - 1) if self.failures <= QUICK_RESTARTS else LONG_DELAY_S
+        return base_s * (1 + JITTER * (2 * self._chance() - 1))
+
+    def forget(self) -> None:
+        """Begin anew: what failed was changed."""
+        self.failures = 0

@@ -11,8 +11,7 @@ from collections.abc import Iterator
 import pytest
 
 from zbridge.app.handover import channel as channels
-from zbridge.app.handover.channel import Channel, EndError
-from zbridge.app.handover.messages import VERSION, Failed, Given, Go, Hello
+from zbridge.app.handover.channel import VERSION, Channel, EndError, Failed, Given, Go, Hello
 from zbridge.errors import HandoverError
 from zbridge.transport import Parcel
 

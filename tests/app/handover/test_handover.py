@@ -11,9 +11,8 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from zbridge.app.handover.channel import Channel
+from zbridge.app.handover.channel import VERSION, Channel, Given, Go, Hello, Up
 from zbridge.app.handover.incoming import Incoming
-from zbridge.app.handover.messages import VERSION, Given, Go, Hello, Up
 from zbridge.app.handover.outgoing import Outgoing
 from zbridge.errors import HandoverError, NotReady, Refused, Unsupported
 from zbridge.protocol.kept import Exported

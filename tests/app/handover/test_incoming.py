@@ -10,9 +10,8 @@ from typing import Any
 
 import pytest
 
-from zbridge.app.handover.channel import Channel
+from zbridge.app.handover.channel import VERSION, Channel, Failed, Given, Go, Hello, Up
 from zbridge.app.handover.incoming import Incoming
-from zbridge.app.handover.messages import VERSION, Failed, Given, Go, Hello, Up
 from zbridge.errors import HandoverError
 from zbridge.transport import Parcel
 

@@ -11,13 +11,14 @@ import pytest
 
 from zbridge.app.config import Plan, plan
 from zbridge.app.handover import restarts as module
+from zbridge.app.handover.channel import VERSION, Given
 from zbridge.app.handover.incoming import Incoming
-from zbridge.app.handover.messages import VERSION, Given
-from zbridge.app.handover.restarts import Restarts
+from zbridge.app.handover.restarts import ClaimPart, Restarts
 from zbridge.bus.fake import FakeBus
 from zbridge.errors import NotReady, Refused
 from zbridge.fleet.topics import KeySpace
 from zbridge.protocol.kept import Budget, Exported
+from zbridge.robot.ownership import Ownership
 from zbridge.transport import Parcel
 
 DEVICE = {"protocol": "alf", "connect": ["tcp://127.0.0.1:1"]}
@@ -220,3 +221,19 @@ def test_a_robot_is_kept_for_a_successor_only_where_it_is_owned_and_can_go_on(
     assert (given is not None) is kept
     if given is not None:
         assert (given.version, given.device, given.claim, given.listeners) == (VERSION, device, claim, ())
+
+
+async def test_a_claim_that_is_withdrawn_for_the_successor_is_still_deposited_and_comes_back() -> None:
+    ownership = Ownership(FakeBus("1"), KeySpace("fleet", "r1"), clock=lambda: 5.0)
+    part = ClaimPart(ownership)
+    assert part.hand_over(Parcel()) == {}
+    claim = {"since": 2.0, "yielded": False, "close_until": 4.0}
+    ownership.inherit(claim)
+    assert part.hand_over(Parcel()) == claim
+    part.withdraw()
+    assert ownership.export() is None
+    assert part.hand_over(Parcel()) == claim, "the successor may die before it has deposited any"
+    await part.go_on()
+    assert ownership.export() == claim
+    ownership.release()
+    assert part.hand_over(Parcel()) == {}

@@ -10,8 +10,7 @@ from contextlib import suppress
 import pytest
 
 from zbridge.app.config import plan
-from zbridge.app.handover.channel import Channel
-from zbridge.app.handover.messages import VERSION, Given, Hello
+from zbridge.app.handover.channel import VERSION, Channel, Given, Hello
 from zbridge.app.handover.restarts import Restarts
 from zbridge.app.tasks import together
 from zbridge.errors import HandoverError, NotReady

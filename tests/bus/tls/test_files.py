@@ -22,9 +22,8 @@ from zbridge.bus.tls.files import (
 )
 from zbridge.errors import ConfigError
 from zbridge.security.certs import authority, x509
-from zbridge.security.certs.authority import Request
+from zbridge.security.certs.authority import Request, load_certificate
 from zbridge.security.certs.files import Folder
-from zbridge.security.certs.reading import load_certificate
 from zbridge.security.roles import Member
 
 NOW = datetime(2026, 11, 22, 12, 0, 0, tzinfo=UTC)

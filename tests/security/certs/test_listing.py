@@ -11,7 +11,7 @@ from cryptography.hazmat.primitives import hashes
 from tests.security.certs.lab import Lab
 from zbridge.errors import ConfigError
 from zbridge.security.certs import authority
-from zbridge.security.certs.listing import Entry, list_names
+from zbridge.security.certs.authority import Entry, list_names
 from zbridge.security.roles import Member, Roles, save_roles
 
 

@@ -1,7 +1,7 @@
 """The Unix stream socket between a gateway and its successor: messages, and descriptors behind one of them.
 
-A message is its length (4 bytes, big-endian) and its bytes. Descriptors follow in groups, each with one byte. The calls
-block on threads of their own, so that the event loop never does; each has a time limit.
+A message is its length (4 bytes, big-endian) and a MessagePack map with a ``type``. Descriptors follow in groups, each
+with one byte. The calls block on threads of their own, so that the event loop never does; each has a time limit.
 """
 
 from __future__ import annotations
@@ -14,10 +14,13 @@ from typing import TypeVar
 
 import msgspec
 
-from zbridge.app.handover.messages import Failed, Message, decode, encode
 from zbridge.errors import HandoverError
+from zbridge.protocol.kept import Exported
 from zbridge.transport import Parcel
+from zbridge.wire.frames import Partial
 
+VERSION = 2
+"""The form of :class:`Given`. Raise it with every change of what is ``kept`` and of the maps around it."""
 M = TypeVar("M")
 
 MESSAGE_BYTES = 64 * 2**20
@@ -30,6 +33,51 @@ _GROUP = 200
 """Descriptors that are sent at a time; Linux takes 253."""
 _HEADER = 4
 _ENDED = "the other side has ended"
+
+
+class Hello(msgspec.Struct, tag="hello", frozen=True):
+    """Successor: I have read the configuration and joined the bus; ``version`` is the form that I understand."""
+
+    version: int
+    pid: int
+
+
+class Given(msgspec.Struct, tag="given", frozen=True):
+    """Gateway: nothing is read or written any more; take this over, and ``descriptors`` descriptors behind it.
+
+    setup: what must be the same in both configurations. claim: on the robot, None where it is not owned. device: None
+    where it is not served. listeners: in the order of the configuration; none of a gateway that died: the successor
+    binds its own. metrics: numbers of sockets in the parcel. partials: of a gateway that died, the incomplete frame of
+    each stream, in the order of the device's links.
+    """
+
+    version: int
+    setup: Exported
+    descriptors: int
+    claim: Exported | None = None
+    device: Exported | None = None
+    listeners: tuple[Exported, ...] = ()
+    metrics: tuple[int, ...] = ()
+    partials: tuple[Partial, ...] = ()
+
+
+class Up(msgspec.Struct, tag="up", frozen=True):
+    """Successor: everything is taken over and declared; I read and write nothing before :class:`Go`."""
+
+
+class Go(msgspec.Struct, tag="go", frozen=True):
+    """Gateway: all is yours."""
+
+
+class Failed(msgspec.Struct, tag="failed", frozen=True):
+    """Either: it is over, for this reason. The gateway goes on as before."""
+
+    reason: str
+
+
+Message = Hello | Given | Up | Go | Failed
+encode = msgspec.msgpack.Encoder().encode
+decode = msgspec.msgpack.Decoder(Message).decode
 
 
 class Channel:

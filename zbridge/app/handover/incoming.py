@@ -12,8 +12,7 @@ import asyncio
 import logging
 import socket
 
-from zbridge.app.handover.channel import EndError
-from zbridge.app.handover.messages import VERSION, Failed, Given, Go, Hello, Up
+from zbridge.app.handover.channel import VERSION, EndError, Failed, Given, Go, Hello, Up
 from zbridge.app.handover.processes import PROCESSES, Processes
 from zbridge.errors import HandoverError
 from zbridge.protocol.kept import Exported

@@ -24,10 +24,8 @@ import logging
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Protocol, TypeVar
 
-from zbridge.app.handover.channel import Channel
-from zbridge.app.handover.messages import VERSION, Failed, Given, Go, Hello, Up
-from zbridge.app.handover.processes import PROCESSES, OtherProcess, Processes
-from zbridge.app.handover.successor import Successor
+from zbridge.app.handover.channel import VERSION, Channel, Failed, Given, Go, Hello, Up
+from zbridge.app.handover.processes import PROCESSES, OtherProcess, Processes, Successor
 from zbridge.errors import BusError, HandoverError, NotReady, Refused
 from zbridge.protocol.kept import Exported
 from zbridge.transport import Parcel

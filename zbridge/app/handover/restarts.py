@@ -1,4 +1,4 @@
-"""The restarts of one gateway: who may ask for one, what is handed over, and how it is answered."""
+"""The restarts of one gateway: who may ask for one, what is handed over (also the claim), and how it is answered."""
 
 from __future__ import annotations
 
@@ -12,12 +12,10 @@ from collections.abc import Callable, Sequence
 import msgspec
 
 from zbridge.app.config import Plan
-from zbridge.app.handover.claim import ClaimPart
+from zbridge.app.handover.channel import VERSION, Given
 from zbridge.app.handover.incoming import Incoming
-from zbridge.app.handover.messages import VERSION, Given
 from zbridge.app.handover.outgoing import Outgoing, Part
-from zbridge.app.handover.processes import PROCESSES, Processes
-from zbridge.app.handover.successor import Successor
+from zbridge.app.handover.processes import PROCESSES, Processes, Successor
 from zbridge.bus import Bus, Handle, IncomingQuery
 from zbridge.control.gate import NameGate
 from zbridge.control.latch_store import LatchStore
@@ -26,13 +24,56 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Query
 from zbridge.fleet.topics import KeySpace
-from zbridge.protocol.kept import Budget
+from zbridge.protocol.kept import Budget, Exported
 from zbridge.robot.device import Device
-from zbridge.robot.ownership import CLAIM
+from zbridge.robot.ownership import CLAIM, Ownership
 from zbridge.transport import Parcel
 from zbridge.transport.kernel import KERNEL, Kernel
 
 log = logging.getLogger("zbridge.app.handover")
+
+
+class ClaimPart:
+    """The claim of a gateway that owns its robot."""
+
+    def __init__(self, ownership: Ownership) -> None:
+        self._ownership = ownership
+        self._claim: Exported | None = None
+        self._withdrawn = False
+
+    def __repr__(self) -> str:
+        return f"<ClaimPart {self._ownership!r}>"
+
+    async def prepare(self, reason: str, within_s: float) -> None:
+        """Report the successor's claim as no rival's."""
+        self._ownership.hands_over = True
+
+    async def shut(self) -> None:
+        """Do nothing."""
+
+    def hold(self) -> None:
+        """Do nothing."""
+
+    def hand_over(self, parcel: Parcel) -> Exported:
+        """Describe the claim; ``{}`` where the robot is not owned. One that was withdrawn is the successor's."""
+        if not self._withdrawn:
+            self._claim = self._ownership.export()
+        return self._claim or {}
+
+    async def go_on(self) -> None:
+        """Claim the robot again, where the claim was withdrawn."""
+        self._ownership.hands_over = self._withdrawn = False
+        if self._claim is not None and self._ownership.export() is None:
+            self._ownership.inherit(self._claim)
+            self._ownership.begin()
+
+    def withdraw(self) -> None:
+        """Leave the claim, and the liveliness token, to the successor's."""
+        self._withdrawn = True
+        self._ownership.release()
+
+    async def release(self) -> None:
+        """Do nothing: the claim is withdrawn."""
 
 
 class Restarts:

@@ -1,14 +1,17 @@
-"""An authority in a folder: it issues, renews and revokes names. The time is an argument.
+"""An authority in a folder: it issues, renews, revokes and lists names, and reads them back. The time is an argument.
 
 Every change of the folder is made under its lock. Files of a name are written before ``roles.toml``: after a crash a
-name may have files that no router knows, never the other way round. Every function raises ConfigError.
+name may have files that no router knows, never the other way round. Every function raises ConfigError, which names the
+file.
 """
 
 from __future__ import annotations
 
 from datetime import datetime, timedelta
+from pathlib import Path
 
 import msgspec
+from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
 from cryptography.x509 import Certificate
 
 from zbridge.errors import ConfigError
@@ -20,15 +23,68 @@ from zbridge.security.certs.files import (
     changing,
     make_folder,
     read,
+    read_secret,
     refuse_to_overwrite,
     write,
 )
-from zbridge.security.certs.reading import load_authority, load_certificate, load_name
 from zbridge.security.roles import ROLES, Member, Roles, check_member, check_name, load_roles, save_roles
 
 AUTHORITY_DAYS = 3650
 DAYS = 365
 """How long a certificate is valid, unless told otherwise."""
+SOON = timedelta(days=30)
+"""How long before its end a certificate is due to be renewed."""
+
+
+def load_certificate(path: Path) -> Certificate:
+    """Read a certificate; raise ConfigError."""
+    content = read(path)
+    try:
+        return x509.read_certificate(content)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+
+
+def load_authority(folder: Folder, now: datetime) -> x509.Authority:
+    """Read the authority; raise ConfigError also if it has expired or its key is not its own."""
+    certificate = load_certificate(folder.ca)
+    if certificate.not_valid_after_utc <= now:
+        raise ConfigError(
+            f"{folder.ca}: the authority expired on {certificate.not_valid_after_utc:%Y-%m-%d}; `zbridge certs init"
+            " --force` makes another, and every name then needs `zbridge certs renew`"
+        )
+    return x509.Authority(certificate, _matching_key(folder.ca_key, certificate))
+
+
+def load_name(folder: Folder, name: str) -> tuple[EllipticCurvePrivateKey, Certificate]:
+    """Read key and certificate of a name; raise ConfigError also if they do not match or others can read the key."""
+    files = folder.of(name)
+    certificate = load_certificate(files.certificate)
+    return _matching_key(files.key, certificate), certificate
+
+
+def fault(certificate: Certificate, authority: Certificate, expected: str, now: datetime) -> str:
+    """Say why a certificate would be refused, or be nobody's; empty: it would not. expected: its common name."""
+    if not x509.issued_by(certificate, authority):
+        return "issued by another authority"
+    if (found := x509.common_name_of(certificate)) != expected:
+        return f"issued as {found}, but roles.toml says {expected}"
+    if certificate.not_valid_after_utc <= now:
+        return f"expired on {certificate.not_valid_after_utc:%Y-%m-%d}"
+    if certificate.not_valid_before_utc > now:
+        return f"not valid before {certificate.not_valid_before_utc:%Y-%m-%d %H:%M} UTC"
+    return ""
+
+
+def _matching_key(path: Path, certificate: Certificate) -> EllipticCurvePrivateKey:
+    content = read_secret(path)
+    try:
+        key = x509.read_key(content)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+    if not x509.belongs_to(certificate, key):
+        raise ConfigError(f"{path}: not the key of the certificate {x509.common_name_of(certificate)!r} beside it")
+    return key
 
 
 class Request(msgspec.Struct, frozen=True):
@@ -175,3 +231,46 @@ def _present(folder: Folder, name: str) -> Certificate | None:
 def _issued(certificate: Certificate, replaced_until: datetime | None = None) -> Issued:
     expires = certificate.not_valid_after_utc
     return Issued(x509.common_name_of(certificate), expires, x509.fingerprint(certificate), replaced_until)
+
+
+class Entry(msgspec.Struct, frozen=True):
+    """One name. problem: what is wrong with its files, or that it is revoked; empty: nothing."""
+
+    name: str
+    role: str | None = None
+    robots: tuple[str, ...] = ()
+    hosts: tuple[str, ...] = ()
+    expires: datetime | None = None
+    fingerprint: str | None = None
+    problem: str = ""
+
+
+def list_names(folder: Folder, now: datetime) -> list[Entry]:
+    """Return every name in ``roles.toml``, then the revoked ones; raise ConfigError if there is no authority."""
+    roles = load_roles(folder.roles)
+    authority = load_certificate(folder.ca)
+    known = [_entry(folder, authority, roles, name, now) for name in roles.names]
+    return known + [Entry(name, problem="revoked") for name in roles.revoked]
+
+
+def _entry(folder: Folder, authority: Certificate, roles: Roles, name: str, now: datetime) -> Entry:
+    member = roles.names[name]
+    try:
+        _, certificate = load_name(folder, name)
+    except ConfigError as error:
+        return Entry(name, member.role, member.robots, problem=str(error))
+    return Entry(
+        name,
+        member.role,
+        member.robots,
+        x509.hosts_of(certificate),
+        certificate.not_valid_after_utc,
+        x509.fingerprint(certificate),
+        fault(certificate, authority, roles.common_name(name), now) or _warning(certificate, now),
+    )
+
+
+def _warning(certificate: Certificate, now: datetime) -> str:
+    left = certificate.not_valid_after_utc - now
+    days = left // timedelta(days=1)
+    return f"expires in {days} day{'s' * (days != 1)}" if left < SOON else ""

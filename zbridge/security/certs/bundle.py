@@ -11,7 +11,7 @@ import msgspec
 from zbridge.errors import ConfigError
 from zbridge.protocol.networks import is_loopback
 from zbridge.security.certs import x509
-from zbridge.security.certs.authority import check_known
+from zbridge.security.certs.authority import check_known, fault, load_certificate, load_name
 from zbridge.security.certs.files import (
     PUBLIC,
     SECRET,
@@ -23,7 +23,6 @@ from zbridge.security.certs.files import (
     refuse_to_overwrite,
     write,
 )
-from zbridge.security.certs.reading import fault, load_certificate, load_name
 from zbridge.security.roles import Roles, load_roles
 
 PORT = 7447

@@ -10,11 +10,10 @@ from typing import Any
 import pytest
 
 from zbridge.errors import NotReady
-from zbridge.host import launch
-from zbridge.host.fd_channel import Post
+from zbridge.host import succession
+from zbridge.host.fd_channel import Fork, Post
 from zbridge.host.files import RobotFile
-from zbridge.host.launch import Launcher
-from zbridge.host.messages import Fork
+from zbridge.host.succession import Launcher
 
 
 class Forks:
@@ -89,7 +88,7 @@ async def test_a_file_that_is_gone_starts_nothing_and_a_disk_that_does_not_answe
     async def never(*_: object) -> None:
         await asyncio.Event().wait()
 
-    monkeypatch.setattr(launch, "STAT_S", 0.01)
+    monkeypatch.setattr(succession, "STAT_S", 0.01)
     monkeypatch.setattr(asyncio, "to_thread", never)
     started: Any = await launcher(forks).start(RobotFile(path, b""))
     started[1].close()

@@ -20,7 +20,7 @@ from tests.e2e.processes import ROOT, module
 from zbridge.app import until_signal
 from zbridge.cli import set_up_log
 from zbridge.cli.fork_server import run
-from zbridge.host.fd_channel import Post
+from zbridge.host.fd_channel import FdChannel
 from zbridge.host.fork_server import Birth, serve
 from zbridge.host.settings import HostSettings
 from zbridge.host.supervisor import Supervisor
@@ -108,7 +108,7 @@ def hang(birth: Birth) -> int:
 def main() -> None:
     if sys.argv[1] == FORKS:
         steps.watch(Path(sys.argv[2]))
-        serve(Post.inherited(int(sys.argv[3])), hang)
+        serve(FdChannel.inherited(int(sys.argv[3])), hang)
         return
     set_up_log(verbose=False)
     folder = Path(sys.argv[1])

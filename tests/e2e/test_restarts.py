@@ -131,14 +131,14 @@ FAKE = """
 import os, socket, sys, time
 sys.path.insert(0, {root!r})
 from zbridge.app.handover import channel as messages
-from zbridge.app.handover.channel import Channel
+from zbridge.app.handover.channel import HandoverChannel
 descriptor = int(sys.argv[sys.argv.index("--take-over") + 1])
-channel = Channel(socket.socket(fileno=descriptor))
+channel = HandoverChannel(socket.socket(fileno=descriptor))
 how = {how!r}
 if how == "silent":
     time.sleep(60)
 channel._send(messages.Hello(9 if how == "newer" else messages.VERSION, os.getpid()), None)
-given = channel._receive(messages.Given, 30)
+given = channel._receive(messages.HandoverState, 30)
 if how == "crash":
     os.kill(os.getpid(), 9)
 parcel = channel._receive_parcel(given.descriptors, 5)
@@ -150,10 +150,10 @@ time.sleep(60)
 @pytest.mark.parametrize(
     ("how", "reason"),
     [
-        ("silent", "says nothing"),
+        ("silent", "sent nothing"),
         ("newer", f"states of version 9, this gateway has {VERSION}"),
         ("crash", "the other side has ended"),
-        ("hangs", "says nothing for 0.5 s"),
+        ("hangs", "sent nothing for 0.5 s"),
     ],
 )
 def test_a_broken_successor_is_ended_and_the_gateway_goes_on(

@@ -207,8 +207,9 @@ def _claims() -> Iterator[bytes]:
 
 def _processes() -> Iterator[bytes]:
     said: list[Any] = [
-        handover.Hello(2, 1), handover.Given(2, {"a": 1}, 3, listeners=({"b": b"c"},), metrics=(1,)), handover.Up(),
-        handover.Failed("no"), supervisor.Beat(), supervisor.Opened(1, "robot"), supervisor.Kept(((1, 2),), 1, 9),
+        handover.Hello(2, 1), handover.HandoverState(2, {"a": 1}, 3, listeners=({"b": b"c"},), metrics=(1,)),
+        handover.Up(), handover.Failed("no"),
+        supervisor.Heartbeat(), supervisor.Opened(1, "robot"), supervisor.Deposited(((1, 2),), 1, 9),
         supervisor.Fork("r1.toml", "r1"), supervisor.Forked(7), supervisor.Ready(),
     ]  # fmt: skip
     yield from map(msgspec.msgpack.encode, said)

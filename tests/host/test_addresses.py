@@ -16,7 +16,7 @@ import pytest
 
 from tests.ports import free_port
 from zbridge.app import plan
-from zbridge.app.config import Plan
+from zbridge.app.config import GatewayPlan
 from zbridge.errors import ConfigError
 from zbridge.host import addresses
 from zbridge.host.addresses import AddressLock, hold_addresses, holders, require_free, resolve
@@ -36,7 +36,7 @@ def held() -> Iterator[list[AddressLock]]:
         lock.close()
 
 
-def robot(name: str, port: int, host: str = "127.0.0.1", **device: Any) -> Plan:
+def robot(name: str, port: int, host: str = "127.0.0.1", **device: Any) -> GatewayPlan:
     connect = [f"tcp://{host}:{port}"]
     return plan({"robot": {"name": name}, "device": {"protocol": "tcpudp", "connect": connect, **device}})
 

@@ -1,4 +1,4 @@
-"""What a gateway process tells its supervisor: the device and the links are played, the post is a real socket."""
+"""What a gateway process tells its supervisor: the device and the links are played, the channel is a real socket."""
 
 import asyncio
 import logging
@@ -9,17 +9,17 @@ from collections.abc import AsyncIterator, Iterator
 import msgspec
 import pytest
 
-from zbridge.app.handover.channel import VERSION, Given
+from zbridge.app.handover.channel import VERSION, HandoverState
 from zbridge.errors import HandoverError
 from zbridge.host import child
 from zbridge.host.child import Reporter
 from zbridge.host.fd_channel import (
-    Beat,
     Closed,
-    Kept,
+    Deposited,
+    FdChannel,
+    Heartbeat,
     Message,
     Opened,
-    Post,
     Shared,
     Started,
     Succeeded,
@@ -61,24 +61,24 @@ class PlayedDevice:
 
 
 class Scene:
-    """A reporter, its device, and the supervisor's end of the post."""
+    """A reporter, its device, and the supervisor's end of the channel."""
 
     def __init__(self) -> None:
-        self.post, far = Post.pair()
-        self.reporter, self.device = Reporter(Post(far)), PlayedDevice()
+        self.channel, far = FdChannel.pair()
+        self.reporter, self.device = Reporter(FdChannel(far)), PlayedDevice()
         self.descriptors = 0
         self.reporter.begin()
-        received = self.post.receive()
+        received = self.channel.receive()
         assert received is not None
         shared, (descriptor,) = received
         assert shared == Shared()
         self.memory = MemoryReader(descriptor)
         self.reporter.began(self.device)
-        assert self.told()[:2] == [Beat(LastStop()), Kept()], "the first deposit tells that there is nothing"
+        assert self.told()[:2] == [Heartbeat(LastStop()), Deposited()], "the first deposit tells that there is nothing"
 
     def close(self) -> None:
         self.reporter.close()
-        self.post.close()
+        self.channel.close()
         self.memory.close()
 
     def told(self) -> list[Message]:
@@ -86,7 +86,7 @@ class Scene:
         messages = list[Message]()
         while True:
             try:
-                received = self.post.receive()
+                received = self.channel.receive()
             except BlockingIOError:
                 return messages
             assert received is not None
@@ -120,12 +120,12 @@ def sock() -> Iterator[socket.socket]:
 
 
 async def test_a_loop_that_turns_beats_and_more_often_while_the_robot_is_driven(scene: Scene, monkeypatch) -> None:
-    monkeypatch.setattr(child, "BEAT_S", 3600.0)
-    monkeypatch.setattr(child, "DRIVEN_BEAT_S", 0.01)
+    monkeypatch.setattr(child, "HEARTBEAT_S", 3600.0)
+    monkeypatch.setattr(child, "DRIVEN_HEARTBEAT_S", 0.01)
     scene.device.now = LastStop(driven=True, state="established")
     scene.reporter.changed()
-    assert scene.told() == [Beat(scene.device.now)], "at once"
-    assert await scene.soon() == [Beat(scene.device.now)]
+    assert scene.told() == [Heartbeat(scene.device.now)], "at once"
+    assert (await scene.soon())[0] == Heartbeat(scene.device.now)
     scene.device.now = LastStop(state="established")
     scene.reporter.changed()
     scene.told()
@@ -136,10 +136,10 @@ async def test_a_loop_that_turns_beats_and_more_often_while_the_robot_is_driven(
 async def test_another_stop_is_told_with_the_command_that_made_it(scene: Scene) -> None:
     scene.reporter.changed()
     assert scene.told() == []
-    await asyncio.sleep(child.LOOK_S)
+    await asyncio.sleep(child.INSPECT_S)
     scene.device.now = LastStop(frames=(StopFrame(b"mode"), StopFrame(b"stop", True)), gap_s=0.1, state="established")
     scene.reporter.changed()
-    assert scene.told() == [Beat(scene.device.now)]
+    assert scene.told() == [Heartbeat(scene.device.now)]
 
 
 async def test_a_stop_that_a_command_changed_is_told_at_once_however_many_commands_come(scene: Scene) -> None:
@@ -148,7 +148,7 @@ async def test_a_stop_that_a_command_changed_is_told_at_once_however_many_comman
     scene.reporter.changed()
     assert scene.told() == [], "looked at a moment ago"
     scene.reporter.changed(at_once=True)
-    assert scene.told() == [Beat(scene.device.now)]
+    assert scene.told() == [Heartbeat(scene.device.now)]
 
 
 async def test_a_link_comes_with_its_sockets_and_goes_at_once(scene: Scene, sock: socket.socket) -> None:
@@ -160,7 +160,7 @@ async def test_a_link_comes_with_its_sockets_and_goes_at_once(scene: Scene, sock
     scene.device.stands = Boundary(outgoing=False)
     scene.device.now = LastStop(state="handshaking")
     scene.reporter.changed()
-    assert scene.told() == [Beat(scene.device.now, {1: Boundary(outgoing=False)})]
+    assert scene.told() == [Heartbeat(scene.device.now, {1: Boundary(outgoing=False)})]
     scene.reporter.linked("robot", link, False)
     scene.reporter.linked("robot", link, False)
     assert scene.told() == [Closed(1)]
@@ -177,7 +177,7 @@ async def test_a_socket_for_datagrams_that_is_opened_later_comes_with_the_next_b
         scene.told()
         scene.device.now = LastStop(state="handshaking")
         scene.reporter.changed()
-        assert scene.told() == [Opened(1, "robot"), Beat(scene.device.now, {1: Boundary()})]
+        assert scene.told() == [Opened(1, "robot"), Heartbeat(scene.device.now, {1: Boundary()})]
 
 
 async def test_the_first_link_drives(scene: Scene, sock: socket.socket) -> None:
@@ -190,7 +190,7 @@ async def test_the_first_link_drives(scene: Scene, sock: socket.socket) -> None:
 
 async def test_a_device_that_has_left_its_robot_leaves_no_stop(scene: Scene) -> None:
     scene.reporter.ended()
-    assert scene.told() == [Beat()]
+    assert scene.told() == [Heartbeat()]
     scene.reporter.changed()
     assert scene.told() == []
 
@@ -202,11 +202,11 @@ async def test_a_successor_is_asked_for_with_its_socket_and_the_answer_awaited(s
         assert await scene.soon() == [WantSuccessor()]
         assert scene.descriptors == 1
         assert not asking.done()
-        scene.post.send(Started())
+        scene.channel.send(Started())
         await asking
         assert scene.reporter.handed_over(), "the supervisor looks after the robot"
         assert scene.told() == [Succeeded()]
-        while scene.reporter._post.send(Beat()):
+        while scene.reporter._channel.send(Heartbeat()):
             pass
         with pytest.raises(HandoverError, match="does not listen"):
             scene.reporter.handed_over()
@@ -217,7 +217,7 @@ async def test_why_no_successor_was_started_is_told(scene: Scene, monkeypatch) -
     with near, far:
         asking = asyncio.ensure_future(scene.reporter.start_successor(far))
         await scene.soon()
-        scene.post.send(Started("a faulty file"))
+        scene.channel.send(Started("a faulty file"))
         with pytest.raises(HandoverError, match="a faulty file"):
             await asking
         monkeypatch.setattr(child, "ANSWER_S", 0.01)
@@ -225,7 +225,7 @@ async def test_why_no_successor_was_started_is_told(scene: Scene, monkeypatch) -
             await scene.reporter.start_successor(far)
 
 
-GIVEN = Given(VERSION, {}, 1, claim={"since": 1.0}, device={"links": []})
+GIVEN = HandoverState(VERSION, {}, 1, claim={"since": 1.0}, device={"links": []})
 
 
 def linked(scene: Scene, sock: socket.socket, name: str = "robot") -> FakeLink:
@@ -236,45 +236,47 @@ def linked(scene: Scene, sock: socket.socket, name: str = "robot") -> FakeLink:
     return link
 
 
-def deposit(scene: Scene, state: str) -> Kept:
+def deposit(scene: Scene, state: str) -> Deposited:
     """Let the state of the robot become another one, with which the deposit is made anew."""
     scene.device.now = LastStop(state=state)
     scene.reporter.changed()
-    return next(message for message in scene.told() if isinstance(message, Kept))
+    return next(message for message in scene.told() if isinstance(message, Deposited))
 
 
 async def test_what_a_successor_needs_is_deposited_with_its_sockets(scene: Scene, sock: socket.socket) -> None:
     linked(scene, sock)
     left = [GIVEN]
 
-    def keep(parcel: Parcel, budget: Budget) -> Given | None:
+    def keep(parcel: Parcel, budget: Budget) -> HandoverState | None:
         parcel.put(sock.fileno())
         return left[0] if left else None
 
-    scene.reporter.keep = keep
+    scene.reporter.describe = keep
     kept = deposit(scene, "handshaking")
-    assert msgspec.msgpack.decode(scene.memory.deposit(kept.area, kept.size), type=Given) == GIVEN
+    assert msgspec.msgpack.decode(scene.memory.deposit(kept.area, kept.size), type=HandoverState) == GIVEN
     assert kept.sockets == ((1, 0),)
     left[0] = msgspec.structs.replace(GIVEN, claim={"since": 2.0})
     newer = deposit(scene, "established")
     assert newer.area != kept.area, "the one before it is still there if this process dies now"
     left.clear()
-    assert deposit(scene, "closing") == Kept(), "nobody could go on any more"
+    assert deposit(scene, "closing") == Deposited(), "nobody could go on any more"
 
 
 async def test_another_stop_comes_with_another_deposit(scene: Scene, sock: socket.socket) -> None:
     linked(scene, sock)
     numbers = iter(range(9))
 
-    def keep(parcel: Parcel, budget: Budget) -> Given:
+    def keep(parcel: Parcel, budget: Budget) -> HandoverState:
         parcel.put(sock.fileno())
         return msgspec.structs.replace(GIVEN, claim={"since": next(numbers)})
 
-    scene.reporter.keep = keep
-    await asyncio.sleep(child.LOOK_S)
+    scene.reporter.describe = keep
+    await asyncio.sleep(child.INSPECT_S)
     scene.device.now = LastStop(frames=(StopFrame(b"mode"), StopFrame(b"stop")), state="established")
     scene.reporter.changed()
-    assert isinstance(scene.told()[0], Kept), "a robot that drives itself is stopped by another session than before"
+    assert isinstance(scene.told()[0], Deposited), (
+        "a robot that drives itself is stopped by another session than before"
+    )
 
 
 async def test_what_is_published_for_the_first_time_is_deposited_soon_and_once(
@@ -283,17 +285,17 @@ async def test_what_is_published_for_the_first_time_is_deposited_soon_and_once(
     linked(scene, sock)
     said = ["nothing"]
 
-    def keep(parcel: Parcel, budget: Budget) -> Given:
+    def keep(parcel: Parcel, budget: Budget) -> HandoverState:
         parcel.put(sock.fileno())
         return msgspec.structs.replace(GIVEN, claim={"since": said[-1]})
 
-    scene.reporter.keep = keep
+    scene.reporter.describe = keep
     deposit(scene, "established")
     said.append("what is said once in a connection")
     for _ in range(100):
         scene.reporter.published()
-    (kept,) = await scene.soon(2 * child.LOOK_S)
-    assert isinstance(kept, Kept)
+    (kept,) = await scene.soon(2 * child.INSPECT_S)
+    assert isinstance(kept, Deposited)
     assert b"said once" in scene.memory.deposit(kept.area, kept.size)
 
 
@@ -303,17 +305,17 @@ async def test_a_deposit_that_cannot_be_made_is_told_once_and_the_beats_go_on(
 ) -> None:
     linked(scene, sock)
 
-    def keep(parcel: Parcel, budget: Budget) -> Given | None:
+    def keep(parcel: Parcel, budget: Budget) -> HandoverState | None:
         if fault == "raises":
             raise KeyError("a protocol's fault")
         value = "\udcff" if "UTF-8" in fault else bytes(DEPOSIT_BYTES)
         return msgspec.structs.replace(GIVEN, device={"links": [value]})
 
-    scene.reporter.keep = keep
+    scene.reporter.describe = keep
     for state in ("handshaking", "established", "closing"):
         scene.device.now = LastStop(state=state)
         scene.reporter.changed()
-        assert scene.told() == [Beat(scene.device.now, {1: Boundary()})]
+        assert scene.told() == [Heartbeat(scene.device.now, {1: Boundary()})]
     (record,) = caplog.records
     assert record.levelno == logging.WARNING
     assert "a crash would end the robot's connection" in record.getMessage()
@@ -326,13 +328,13 @@ async def test_what_is_left_out_of_a_deposit_is_told_once_a_minute_at_most(
     linked(scene, sock)
     sizes = iter((child.VALUE_BYTES, child.VALUE_BYTES + 1, child.VALUE_BYTES + 2))
 
-    def keep(parcel: Parcel, budget: Budget) -> Given:
+    def keep(parcel: Parcel, budget: Budget) -> HandoverState:
         size = next(sizes)
         parcel.put(sock.fileno())
         admitted = budget.admits("Robot.map", bytes(size))
         return msgspec.structs.replace(GIVEN, device={"links": [size], "map": admitted})
 
-    scene.reporter.keep = keep
+    scene.reporter.describe = keep
     for state in ("handshaking", "established", "closing"):
         deposit(scene, state)
     (record,) = caplog.records
@@ -378,7 +380,7 @@ async def test_a_link_that_comes_and_goes_often_leaves_the_slots_of_others_alone
 async def test_the_end_of_the_supervisor_ends_the_process_in_order(scene: Scene) -> None:
     ended = asyncio.Event()
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, ended.set)
-    scene.post.close()
+    scene.channel.close()
     async with asyncio.timeout(10):
         await ended.wait()
     asyncio.get_running_loop().remove_signal_handler(signal.SIGTERM)

@@ -9,11 +9,11 @@ from collections.abc import Iterator
 import msgspec
 import pytest
 
-from zbridge.app.handover.channel import VERSION, Given
+from zbridge.app.handover.channel import VERSION, HandoverState
 from zbridge.errors import HandoverError
 from zbridge.host import duplicates
 from zbridge.host.deposit import Deposit
-from zbridge.host.fd_channel import Kept
+from zbridge.host.fd_channel import Deposited
 from zbridge.host.memory import MemoryWriter
 from zbridge.robot.observer import Boundary, LastStop, StopFrame
 from zbridge.wire.frames import Partial
@@ -32,10 +32,10 @@ class Played:
     def __init__(self, stream: socket.socket, given: Played | None = None) -> None:
         self.deposit, self.memory, self._stream = Deposit(), MemoryWriter(), stream
         self.deposit.share(os.dup(self.memory.descriptor))
-        self.memory.sent()
+        self.memory.close_descriptor()
         self.link = 0
         if given is not None:
-            self.deposit.given, given.deposit = given.deposit, Deposit()
+            self.deposit.predecessor, given.deposit = given.deposit, Deposit()
 
     def opens(self, link: int, name: str = "robot") -> None:
         self.link = link
@@ -43,10 +43,10 @@ class Played:
         self.deposit.duplicates.opened(link, name, [os.dup(self._stream.fileno())], drives=True)
 
     def deposits(self, what: str) -> None:
-        self.leaves(msgspec.msgpack.encode(Given(VERSION, {}, 1, device={"what": what})))
+        self.leaves(msgspec.msgpack.encode(HandoverState(VERSION, {}, 1, device={"what": what})))
 
     def leaves(self, data: bytes) -> None:
-        self.deposit.keep(Kept(((self.link, 0),), self.memory.deposit(data), len(data)))
+        self.deposit.note(Deposited(((self.link, 0),), self.memory.deposit(data), len(data)))
 
     def close(self) -> None:
         self.deposit.close()
@@ -110,9 +110,9 @@ def test_why_nothing_can_be_taken_over_is_told(pair: Pair) -> None:
     process.memory.reading(1)
     assert "died while it read" in reason()
     process.memory.cut(1, Partial())
-    process.deposit.duplicates.stands({1: Boundary(outgoing=False)})
+    process.deposit.duplicates.set_boundaries({1: Boundary(outgoing=False)})
     assert "written half a frame" in reason()
-    process.deposit.duplicates.stands({1: Boundary()})
+    process.deposit.duplicates.set_boundaries({1: Boundary()})
     process.deposit.closed(1)
     assert "left no state" in reason()
 
@@ -134,7 +134,7 @@ def test_until_its_first_deposit_a_process_leaves_what_it_was_given(pair: Pair) 
     after.memory.cut(7, Partial())
     after.deposits("after")
     assert inherited(after.deposit) == ("after", Partial())
-    assert after.deposit.given is None
+    assert after.deposit.predecessor is None
 
 
 def test_a_third_process_leaves_what_the_first_deposited_if_nobody_has_since(pair: Pair) -> None:
@@ -171,7 +171,7 @@ def test_a_deposit_of_nothing_closes_what_was_given_so_that_the_robot_sees_an_en
     assert after.deposit.has_links
     with pytest.raises(BlockingIOError):
         pair.robot.recv(1)
-    after.deposit.keep(Kept())
+    after.deposit.note(Deposited())
     assert not after.deposit.has_links
     assert pair.robot.recv(1) == b""
 
@@ -193,5 +193,5 @@ def test_a_state_that_cannot_be_read_is_told_as_such(pair: Pair, data: bytes) ->
     process.opens(1)
     process.leaves(data)
     process.memory.cut(1, Partial())
-    with pytest.raises(HandoverError, match="cannot be understood"):
+    with pytest.raises(HandoverError, match="its deposit is invalid"):
         process.deposit.inheritance()

@@ -67,7 +67,7 @@ async def test_a_link_that_does_not_drive_gets_no_stop(robot: Robot) -> None:
 
 
 async def test_a_frame_that_was_begun_is_not_continued_with_a_stop(robot: Robot, kept: Duplicates) -> None:
-    kept.stands({1: Boundary(outgoing=False), 9: Boundary()})
+    kept.set_boundaries({1: Boundary(outgoing=False), 9: Boundary()})
     assert await kept.stop(STOP) is False
     kept.close()
     assert robot.end.recv(100) == b""
@@ -134,9 +134,9 @@ async def test_a_robot_that_is_held_up_in_its_sending_reads_its_stop_before_the_
         await asyncio.sleep(0.2)
         kept = Duplicates()
         kept.opened(1, "robot", [os.dup(ours.fileno())], drives=True)
-        kept.stands({1: Boundary()})
+        kept.set_boundaries({1: Boundary()})
         ours.close()
         assert await kept.stop(LastStop(frames=(StopFrame(b"stop"),)), 1)
-        await kept.leave()
+        await kept.drain()
         thread.join(5)
     assert b"".join(read) == b"stop"

@@ -8,13 +8,13 @@ from collections.abc import Iterator
 import pytest
 
 from zbridge.host.fd_channel import (
-    Beat,
     Closed,
+    FdChannel,
     Fork,
     Forked,
+    Heartbeat,
     Message,
     Opened,
-    Post,
     Ready,
     Started,
     Succeeded,
@@ -25,7 +25,7 @@ from zbridge.robot.observer import Boundary, LastStop, StopFrame
 
 STOP = LastStop(driven=True, frames=(StopFrame(b"\x01"), StopFrame(b"\x02", True)), gap_s=0.1, state="established")
 MESSAGES: list[Message] = [
-    Beat(STOP, {3: Boundary(outgoing=False)}, hands_over=True),
+    Heartbeat(STOP, {3: Boundary(outgoing=False)}, hands_over=True),
     Opened(3, "vehicle", drives=False),
     Closed(3),
     Want(),
@@ -38,21 +38,21 @@ MESSAGES: list[Message] = [
 
 
 @pytest.fixture
-def ends() -> Iterator[tuple[Post, Post]]:
-    near, far = Post.pair()
-    other = Post(far)
+def ends() -> Iterator[tuple[FdChannel, FdChannel]]:
+    near, far = FdChannel.pair()
+    other = FdChannel(far)
     yield near, other
     near.close()
     other.close()
 
 
 @pytest.mark.parametrize("message", MESSAGES, ids=lambda message: type(message).__name__)
-def test_a_message_arrives_as_it_was_sent(ends: tuple[Post, Post], message: Message) -> None:
+def test_a_message_arrives_as_it_was_sent(ends: tuple[FdChannel, FdChannel], message: Message) -> None:
     assert ends[0].send(message)
     assert ends[1].receive() == (message, [])
 
 
-def test_a_descriptor_arrives_as_one_for_the_same_file(ends: tuple[Post, Post]) -> None:
+def test_a_descriptor_arrives_as_one_for_the_same_file(ends: tuple[FdChannel, FdChannel]) -> None:
     reading, writing = os.pipe()
     ends[0].send(Want(), [writing])
     os.close(writing)
@@ -65,7 +65,7 @@ def test_a_descriptor_arrives_as_one_for_the_same_file(ends: tuple[Post, Post]) 
     close_all([reading, descriptor])
 
 
-def test_the_end_of_the_other_process_is_seen_after_its_last_message(ends: tuple[Post, Post]) -> None:
+def test_the_end_of_the_other_process_is_seen_after_its_last_message(ends: tuple[FdChannel, FdChannel]) -> None:
     with pytest.raises(BlockingIOError):
         ends[1].receive()
     ends[0].send(Succeeded())
@@ -75,23 +75,25 @@ def test_the_end_of_the_other_process_is_seen_after_its_last_message(ends: tuple
     assert not ends[1].send(Succeeded())
 
 
-def test_what_a_process_told_before_it_died_is_seen_though_it_left_something_unread(ends: tuple[Post, Post]) -> None:
+def test_what_a_process_told_before_it_died_is_seen_though_it_left_something_unread(
+    ends: tuple[FdChannel, FdChannel],
+) -> None:
     ends[1].send(Started())
-    ends[0].send(Beat())
+    ends[0].send(Heartbeat())
     ends[0].send(Succeeded())
     ends[0].close()
-    assert [ends[1].receive() for _ in range(3)] == [(Beat(), []), (Succeeded(), []), None]
+    assert [ends[1].receive() for _ in range(3)] == [(Heartbeat(), []), (Succeeded(), []), None]
 
 
-def test_what_finds_no_room_is_counted_and_does_not_block(ends: tuple[Post, Post]) -> None:
-    while ends[0].send(Beat()):
+def test_what_finds_no_room_is_counted_and_does_not_block(ends: tuple[FdChannel, FdChannel]) -> None:
+    while ends[0].send(Heartbeat()):
         pass
     assert ends[0].unsent == 1
 
 
 @pytest.mark.parametrize("data", [b"\xc1", b"\x82\xa4type\xa7started\xa6reason\xa1\xff"], ids=["form", "text"])
 def test_what_is_no_message_is_an_error_and_its_descriptors_are_closed(data: bytes) -> None:
-    near, far = Post.pair()
+    near, far = FdChannel.pair()
     with far, contextlib.closing(near), socket.socket() as sent:
         before = len(os.listdir("/proc/self/fd"))
         socket.send_fds(far, [data], [sent.fileno()])

@@ -7,7 +7,7 @@ import pytest
 
 from zbridge.errors import ConfigError
 from zbridge.host import files
-from zbridge.host.files import Changes, Follower, RobotFile, first_look, paths_of, read
+from zbridge.host.files import Changes, Follower, RobotFile, paths_of, read, read_all
 from zbridge.toml import FILE_BYTES
 
 
@@ -27,9 +27,9 @@ class Scene:
         self.follower = Follower((folder,))
         self.running: dict[Path, RobotFile] = {}
 
-    def look(self, *, twice: bool = False) -> dict[str, list[str]]:
+    def poll(self, *, twice: bool = False) -> dict[str, list[str]]:
         """Look, and do what the changes ask for; give the names of the files."""
-        changes = self.follower.look(self.running, twice=twice)
+        changes = self.follower.poll(self.running, twice=twice)
         for old, file in changes.moved:
             del self.running[old]
             self.running[file.path] = file
@@ -55,75 +55,75 @@ def scene(tmp_path: Path) -> Scene:
     write(tmp_path, "a")
     write(tmp_path, "b")
     scene = Scene(tmp_path)
-    assert scene.look() == {"came": ["a", "b"]}
+    assert scene.poll() == {"came": ["a", "b"]}
     return scene
 
 
 def test_files_that_come_change_and_go_are_told_once(scene: Scene) -> None:
-    assert scene.look() == {}
+    assert scene.poll() == {}
     write(scene.folder, "c")
     write(scene.folder, "a", port=11009)
     (scene.folder / "b.toml").unlink()
-    assert scene.look() == {"came": ["c"], "changed": ["a"], "gone": ["b"]}
-    assert scene.look() == {}
+    assert scene.poll() == {"came": ["c"], "changed": ["a"], "gone": ["b"]}
+    assert scene.poll() == {}
 
 
 def test_a_file_that_changes_counts_when_two_looks_show_the_same(scene: Scene) -> None:
-    assert scene.look(twice=True) == {}
+    assert scene.poll(twice=True) == {}
     for port in (11002, 11003):
         write(scene.folder, "a", port=port)
-        assert scene.look(twice=True) == {}
-    assert scene.look(twice=True) == {"changed": ["a"]}
+        assert scene.poll(twice=True) == {}
+    assert scene.poll(twice=True) == {"changed": ["a"]}
     (scene.folder / "a.toml").unlink()
-    assert scene.look(twice=True) == {}
-    assert scene.look(twice=True) == {"gone": ["a"]}
+    assert scene.poll(twice=True) == {}
+    assert scene.poll(twice=True) == {"gone": ["a"]}
 
 
 def test_a_faulty_file_is_told_once_and_its_robot_goes_on(scene: Scene) -> None:
     sound = scene.running[scene.folder / "a.toml"]
     write(scene.folder, "a", more="colour = 1\n")
-    assert scene.look() == {"faulty": ["a"]}
-    assert scene.look() == {}
+    assert scene.poll() == {"faulty": ["a"]}
+    assert scene.poll() == {}
     assert scene.running[sound.path] is sound
     write(scene.folder, "a")
-    assert scene.look() == {}, "it is as it runs"
+    assert scene.poll() == {}, "it is as it runs"
     write(scene.folder, "a", more="colour = 1\n")
-    assert scene.look() == {"faulty": ["a"]}
+    assert scene.poll() == {"faulty": ["a"]}
 
 
 def test_a_second_file_with_the_name_of_a_robot_is_faulty_until_the_first_is_gone(scene: Scene) -> None:
     write(scene.folder, "aa", robot="b", port=11009)
-    (faulty,) = scene.follower.look(scene.running, twice=False).faulty
+    (faulty,) = scene.follower.poll(scene.running, twice=False).faulty
     assert faulty.fault is not None
     assert "robot.name = 'b'" in faulty.fault
     assert "b.toml" in faulty.fault
     (scene.folder / "b.toml").unlink()
-    assert scene.look() == {"came": ["aa"], "gone": ["b"]}
+    assert scene.poll() == {"came": ["aa"], "gone": ["b"]}
 
 
 def test_a_second_file_with_the_address_of_a_robot_is_faulty_until_the_first_has_another_one(scene: Scene) -> None:
     write(scene.folder, "c", host="localhost", port=11002)
-    (faulty,) = scene.follower.look(scene.running, twice=False).faulty
+    (faulty,) = scene.follower.poll(scene.running, twice=False).faulty
     assert faulty.fault is not None
     assert f"device.connect: expected another address than that of {scene.folder}/b.toml" in faulty.fault
     write(scene.folder, "b", port=11009)
-    scene.look()
-    assert scene.look() == {"came": ["c"]}
+    scene.poll()
+    assert scene.poll() == {"came": ["c"]}
     write(scene.folder, "b", port=11001, more="[control]\n")
-    assert scene.look() == {"faulty": ["b"]}, "that of another one that runs"
+    assert scene.poll() == {"faulty": ["b"]}, "that of another one that runs"
 
 
 @pytest.mark.parametrize("twice", [False, True])
 def test_a_file_that_is_renamed_keeps_its_robot(scene: Scene, twice: bool) -> None:
     (scene.folder / "a.toml").rename(scene.folder / "z.toml")
-    looks = [scene.look(twice=twice) for _ in range(2)]
+    looks = [scene.poll(twice=twice) for _ in range(2)]
     assert looks == ([{}, {"moved": ["a z"]}] if twice else [{"moved": ["a z"]}, {}])
 
 
 def test_what_is_no_robot_file_is_left_alone(scene: Scene) -> None:
     (scene.folder / "host.toml").write_text("[host]\n")
     (scene.folder / "a.toml.bak").write_text("nothing")
-    assert scene.look() == {}
+    assert scene.poll() == {}
 
 
 def test_directories_and_files_are_listed_once(scene: Scene) -> None:
@@ -147,7 +147,7 @@ def test_what_cannot_be_started_is_refused(tmp_path: Path, robots: dict[str, str
     for name, robot in robots.items():
         write(tmp_path, name, robot=robot)
     with pytest.raises(ConfigError, match=words):
-        first_look((tmp_path,))
+        read_all((tmp_path,))
 
 
 @pytest.mark.parametrize("what", ["fifo", "device", "large", "brackets", "digits", "name", "bug"])
@@ -171,13 +171,13 @@ def test_whatever_a_file_is_it_is_faulty_and_the_others_are_followed(
         case "bug":
             monkeypatch.setattr("zbridge.host.files.load", lambda path, content: content / 2)
             path.write_text("a = 1")
-    (faulty,) = scene.follower.look(scene.running, twice=False).faulty
+    (faulty,) = scene.follower.poll(scene.running, twice=False).faulty
     assert faulty.fault is not None
     faulty.fault.encode()  # it is logged, and told to the code that takes this supervisor's place
     assert len(faulty.fault) < 500
     monkeypatch.undo()
     write(scene.folder, "a", port=11009)
-    assert scene.look()["changed"] == ["a"]
+    assert scene.poll()["changed"] == ["a"]
 
 
 def test_a_faulty_file_that_is_the_same_is_checked_again_at_sighup_and_now_and_then(
@@ -188,12 +188,12 @@ def test_a_faulty_file_that_is_the_same_is_checked_again_at_sighup_and_now_and_t
     monkeypatch.setattr(files, "check", lambda path, content: [checked.append(path), check(path, content)][1])
     write(scene.folder, "a", more="colour = 1\n")
     for _ in range(5):
-        scene.look(twice=True)
+        scene.poll(twice=True)
     assert len(checked) == 1, "a large file takes long to check"
-    scene.look(twice=False)
+    scene.poll(twice=False)
     assert len(checked) == 2
     monkeypatch.setattr(files, "CHECK_AGAIN_S", 0.0)
-    scene.look(twice=True)
+    scene.poll(twice=True)
     assert len(checked) == 3
 
 
@@ -206,4 +206,4 @@ def test_a_host_may_allow_larger_files(tmp_path: Path) -> None:
 def test_a_faulty_file_does_not_keep_the_others_from_starting(tmp_path: Path) -> None:
     write(tmp_path, "a")
     write(tmp_path, "b", more="colour = 1\n")
-    assert [file.fault is None for file in first_look((tmp_path,))] == [True, False]
+    assert [file.fault is None for file in read_all((tmp_path,))] == [True, False]

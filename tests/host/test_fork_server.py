@@ -9,17 +9,17 @@ from pathlib import Path
 import pytest
 
 from zbridge.errors import NotReady
-from zbridge.host import forks as module
-from zbridge.host.fd_channel import Fork, Post
-from zbridge.host.forks import Forks, Stamp, fork_server_command
+from zbridge.host import fork_client as module
+from zbridge.host.fd_channel import FdChannel, Fork
+from zbridge.host.fork_client import ForkClient, Stamp, fork_server_command
 from zbridge.host.supervisor import _become_reaper
 
 SOON_S = 30.0
 
 
 @contextlib.asynccontextmanager
-async def forks(command: list[str] | None = None) -> AsyncIterator[Forks]:
-    made = Forks(command or fork_server_command())
+async def forks(command: list[str] | None = None) -> AsyncIterator[ForkClient]:
+    made = ForkClient(command or fork_server_command())
     try:
         yield made
     finally:
@@ -36,10 +36,10 @@ async def ended(pid: int) -> int:
             await asyncio.sleep(0.01)
 
 
-async def forked(made: Forks, file: Path, content: bytes = b"") -> int:
+async def forked(made: ForkClient, file: Path, content: bytes = b"") -> int:
     """Fork the gateway of a file with this content; nobody listens to what it tells."""
-    post, far = Post.pair()
-    with far, contextlib.closing(post):
+    channel, far = FdChannel.pair()
+    with far, contextlib.closing(channel):
         return await made.fork(Fork(str(file), "r1"), far, content)
 
 
@@ -138,12 +138,12 @@ async def test_a_changed_installation_gets_a_server_of_its_own_and_a_broken_one_
         assert second != first
         command[:] = ["false"]
         assert await server(changes) == second
-        assert "the code of before goes on" in caplog.text
+        assert "the old code continues" in caplog.text
         assert await ended(await forked(made, tmp_path / "none.toml")) == 2
 
 
 def test_the_stamp_of_an_installation_changes_with_its_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from zbridge.host import forks as installation
+    from zbridge.host import fork_client as installation
 
     monkeypatch.setattr(installation, "HOME", tmp_path)
     source = tmp_path / "code.py"

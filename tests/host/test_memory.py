@@ -15,7 +15,7 @@ from zbridge.wire.frames import Partial
 def sides() -> Iterator[tuple[MemoryWriter, MemoryReader]]:
     writer = MemoryWriter()
     reader = MemoryReader(os.dup(writer.descriptor))
-    writer.sent()
+    writer.close_descriptor()
     yield writer, reader
     writer.close()
     reader.close()
@@ -67,12 +67,12 @@ def test_a_deposit_counts_when_it_was_told_and_the_one_before_it_stays_until_the
 ) -> None:
     writer, reader = sides
     first = writer.deposit(b"first")
-    writer.told(first)
+    writer.commit(first)
     second = writer.deposit(DEPOSIT_BYTES * b"2")
     assert reader.deposit(first, 5) == b"first", "the process may die before it tells the second one"
     assert writer.deposit(b"third") == second, "the second one was never told"
     assert reader.deposit(first, 5) == b"first"
-    writer.told(second)
+    writer.commit(second)
     assert writer.deposit(b"fourth") == first
     assert reader.deposit(second, 5) == b"third"
 

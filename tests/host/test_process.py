@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from zbridge.host.fd_channel import Beat, Kept, Opened, Post, Shared, Started, Succeeded, WantSuccessor
+from zbridge.host.fd_channel import Deposited, FdChannel, Heartbeat, Opened, Shared, Started, Succeeded, WantSuccessor
 from zbridge.host.files import RobotFile
 from zbridge.host.memory import MemoryWriter
 from zbridge.host.process import GatewayProcess
@@ -26,8 +26,8 @@ class Scene:
     """A process that sleeps, and the end at which it tells things."""
 
     def __init__(self) -> None:
-        near, far = Post.pair()
-        self.told = Post(far)
+        near, far = FdChannel.pair()
+        self.told = FdChannel(far)
         self.wanted: list[socket.socket] = []
         self.changes = 0
         self.process = GatewayProcess(
@@ -102,42 +102,42 @@ async def test_a_process_that_hung_is_killed_and_counts_as_ended_though_nobody_h
 
 async def test_all_that_a_process_told_before_it_died_counts(scene: Scene) -> None:
     for number in range(200):
-        scene.told.send(Beat(LastStop(state=f"state {number}")))
+        scene.told.send(Heartbeat(LastStop(state=f"state {number}")))
     scene.process.over.set_result(9)
     await scene.process.ended()
     assert scene.process.last.state == "state 199"
-    assert scene.process.heart.beats == 200
+    assert scene.process.watchdog.heartbeats == 200
 
 
 # What it tells
 
 
 async def test_a_beat_tells_state_motion_and_whether_the_process_can_hand_over(scene: Scene) -> None:
-    scene.told.send(Beat(LastStop(driven=True, state="established"), hands_over=True))
-    assert not scene.process.hear(), "there is no more"
+    scene.told.send(Heartbeat(LastStop(driven=True, state="established"), hands_over=True))
+    assert not scene.process.receive(), "there is no more"
     assert (scene.process.last.driven, scene.process.hands_over, scene.changes) == (True, True, 1)
-    scene.told.send(Beat(LastStop(state="established")))
-    scene.process.hear()
+    scene.told.send(Heartbeat(LastStop(state="established")))
+    scene.process.receive()
     assert (scene.process.hands_over, scene.changes) == (False, 1), "the state is the same"
-    scene.told.send(Beat(LastStop(state="closed")))
-    scene.process.hear()
+    scene.told.send(Heartbeat(LastStop(state="closed")))
+    scene.process.receive()
     assert scene.changes == 2
 
 
 async def test_others_have_their_turn_while_a_process_tells_much(scene: Scene) -> None:
     for _ in range(70):
-        scene.told.send(Beat())
-    assert scene.process.hear(), "there is more"
-    assert scene.process.heart.beats == 64
-    assert not scene.process.hear()
-    assert scene.process.heart.beats == 70
+        scene.told.send(Heartbeat())
+    assert scene.process.receive(), "there is more"
+    assert scene.process.watchdog.heartbeats == 64
+    assert not scene.process.receive()
+    assert scene.process.watchdog.heartbeats == 70
 
 
 async def test_what_cannot_be_read_is_left_out(scene: Scene) -> None:
     scene.told._socket.send(b"\xc1")
-    scene.told.send(Beat())
-    scene.process.hear()
-    assert scene.process.heart.beats == 1
+    scene.told.send(Heartbeat())
+    scene.process.receive()
+    assert scene.process.watchdog.heartbeats == 1
 
 
 async def test_a_successor_is_wanted_with_a_socket_and_refused_without(scene: Scene) -> None:
@@ -145,7 +145,7 @@ async def test_a_successor_is_wanted_with_a_socket_and_refused_without(scene: Sc
     with near, far:
         scene.told.send(WantSuccessor(), [far.fileno()])
         scene.told.send(WantSuccessor())
-        scene.process.hear()
+        scene.process.receive()
         (end,) = scene.wanted
         end.send(b"hello")
         assert near.recv(10) == b"hello"
@@ -156,19 +156,19 @@ async def test_memory_is_shared_once_and_no_descriptor_is_left_open(scene: Scene
     memory, before = MemoryWriter(), len(os.listdir("/proc/self/fd"))
     for _ in range(3):
         scene.told.send(Shared(), [memory.descriptor])
-    scene.told.send(Beat(), [memory.descriptor])
-    scene.process.hear()
+    scene.told.send(Heartbeat(), [memory.descriptor])
+    scene.process.receive()
     assert scene.process.deposit.memory is not None
     assert len(os.listdir("/proc/self/fd")) == before + 2, "the memory, and its mapping"
-    memory.sent()
+    memory.close_descriptor()
     memory.close()
 
 
 async def test_what_a_process_tells_after_it_has_handed_over_is_its_successors_no_more(scene: Scene) -> None:
-    scene.told.send(Beat(LastStop(state="established")))
+    scene.told.send(Heartbeat(LastStop(state="established")))
     scene.told.send(Succeeded())
-    scene.told.send(Beat(LastStop(state="closed")))
-    scene.process.hear()
+    scene.told.send(Heartbeat(LastStop(state="closed")))
+    scene.process.receive()
     assert (scene.process.succeeded, scene.process.is_over, scene.process.last.state) == (True, True, "established")
     assert await asyncio.wait_for(scene.process.ended(), SOON_S) is None
 
@@ -177,10 +177,10 @@ async def test_the_deposit_of_a_process_counts_until_its_successor_has_one(scene
     for quick in (False, True):
         successor = Scene()
         if quick:
-            successor.process.deposit.keep(Kept((), 0, 0))
+            successor.process.deposit.note(Deposited((), 0, 0))
         deposit = scene.process.deposit
-        scene.process.hand_on(successor.process)
-        assert (successor.process.deposit.given is deposit) is not quick
+        scene.process.hand_deposit_to(successor.process)
+        assert (successor.process.deposit.predecessor is deposit) is not quick
         assert scene.process.deposit is not deposit
         successor.close()
 
@@ -189,7 +189,7 @@ async def test_a_process_that_is_closed_leaves_no_descriptor_open(scene: Scene) 
     before = len(os.listdir("/proc/self/fd"))
     with socket.create_server(("127.0.0.1", 0)) as server:
         scene.told.send(Opened(1, "robot"), [server.fileno()])
-        scene.process.hear()
+        scene.process.receive()
     scene.process.close()
     scene.process.close()
-    assert len(os.listdir("/proc/self/fd")) == before - 1, "its end of the post is closed too"
+    assert len(os.listdir("/proc/self/fd")) == before - 1, "its end of the channel is closed too"

@@ -18,9 +18,9 @@ from zbridge.errors import HandoverError
 from zbridge.host import replacement
 from zbridge.host import supervisor as module
 from zbridge.host.deposit import Deposit
-from zbridge.host.fd_channel import Beat, Kept, Opened, Post, Shared
+from zbridge.host.fd_channel import Deposited, FdChannel, Heartbeat, Opened, Shared
 from zbridge.host.files import Changes, RobotFile
-from zbridge.host.forks import Forks
+from zbridge.host.fork_client import ForkClient
 from zbridge.host.memory import MemoryWriter
 from zbridge.host.process import GatewayProcess
 from zbridge.host.replacement import (
@@ -37,7 +37,7 @@ from zbridge.host.replacement import (
 from zbridge.host.runner import Runner
 from zbridge.host.settings import HostSettings
 from zbridge.host.supervisor import Supervisor
-from zbridge.host.watchdog import DRIVEN_S, EXCUSED_S, Heart, HeartState
+from zbridge.host.watchdog import DRIVEN_S, Watchdog
 from zbridge.robot.observer import Boundary, LastStop, StopFrame
 from zbridge.wire.frames import Partial
 
@@ -48,7 +48,7 @@ NOBODY = 2**22 + 1
 
 
 def empty(**fields: object) -> SupervisorState:
-    return msgspec.structs.replace(SupervisorState(VERSION, ("robots",), at=1.0, look_at=2.0), **fields)
+    return msgspec.structs.replace(SupervisorState(VERSION, ("robots",), at=1.0, check_at=2.0), **fields)
 
 
 @contextlib.contextmanager
@@ -61,7 +61,7 @@ def stored(state: SupervisorState) -> Iterator[int]:
 
 
 def test_a_state_is_read_as_it_was_written_as_often_as_wanted() -> None:
-    process = ProcessState(7, 8, 1.5, HeartState(2.0, DRIVEN_S, 0.1, 3), LAST, 9, True, Kept(((1, 0),), 1, 5), ())
+    process = ProcessState(7, 8, 1.5, Watchdog(2.0, DRIVEN_S, 0.1, 3), LAST, 9, True, Deposited(((1, 0),), 1, 5), ())
     robots = (
         RunnerState("robots/r1.toml", b"\xff", ("fleet", "r1"), 2, 1, None, process),
         RunnerState("robots/r2.toml", b"", None, 0, 6, 61.5),
@@ -107,63 +107,71 @@ def test_no_state_is_said_in_one_line() -> None:
         os.close(reading)
 
 
-def test_a_heart_goes_on_with_what_it_knew() -> None:
-    heart = Heart(100.0)
-    heart.beat(101.0, driven=True)
-    heart.excuse()
-    again = Heart.of(heart.state)
-    assert (again.deadline, again.beats) == (heart.deadline, 1)
-    assert again.deadline == pytest.approx(101.0 + DRIVEN_S + EXCUSED_S)
+def test_the_fields_of_a_state_keep_the_names_that_other_versions_read() -> None:
+    process = ProcessState(7, 8, 1.5, Watchdog(2.0, DRIVEN_S, 0.1, 3), LAST, 9, True, Deposited())
+    state = SupervisorState(VERSION, (), 100.0, 101.0, server=ServerState(5, 6, b"stamp"))
+    written = msgspec.to_builtins(process)
+    assert (written["post"], written["page"], written["kept"]["area"]) == (8, 9, -1)
+    assert written["heart"] == {"last": 2.0, "patience_s": DRIVEN_S, "excused_s": 0.1, "beats": 3}
+    assert (msgspec.to_builtins(state)["look_at"], msgspec.to_builtins(state)["server"]["post"]) == (101.0, 6)
+
+
+def test_a_watchdog_resumes_with_what_it_knew() -> None:
+    watchdog = Watchdog(100.0)
+    watchdog.heartbeat(101.0, driven=True)
+    watchdog.extend()
+    again = msgspec.msgpack.decode(msgspec.msgpack.encode(watchdog), type=Watchdog)
+    assert (again.deadline, again.heartbeats) == (watchdog.deadline, 1)
 
 
 # A process and its robot
 
 
 def resumed_process(state: ProcessState) -> GatewayProcess:
-    process = GatewayProcess(state.pid, Post.inherited(state.post), FILE, wants_successor=lambda *_: None)
+    process = GatewayProcess(state.pid, FdChannel.inherited(state.channel), FILE, wants_successor=lambda *_: None)
     process.resume(state)
     return process
 
 
 async def test_a_process_is_known_as_before_with_its_page_its_kept_state_and_the_stop_of_its_robot() -> None:
-    near, far = Post.pair()
-    told, (ours, robot) = Post(far), socket.socketpair()
+    near, far = FdChannel.pair()
+    told, (ours, robot) = FdChannel(far), socket.socketpair()
     memory = MemoryWriter()
     before = GatewayProcess(NOBODY, near, FILE, wants_successor=lambda *_: None)
     told.send(Shared(), [memory.descriptor])
-    memory.sent()
+    memory.close_descriptor()
     told.send(Opened(3, "robot"), [ours.fileno()])
-    told.send(Kept(((3, 0),), memory.deposit(b"given"), 5))
-    told.send(Beat(LAST, {3: Boundary(outgoing=False)}, hands_over=True))
-    before.hear()
+    told.send(Deposited(((3, 0),), memory.deposit(b"given"), 5))
+    told.send(Heartbeat(LAST, {3: Boundary(outgoing=False)}, hands_over=True))
+    before.receive()
     asyncio.get_running_loop().remove_reader(near.fileno())
     state = msgspec.msgpack.decode(msgspec.msgpack.encode(before.state), type=ProcessState)
     after = resumed_process(
         msgspec.structs.replace(
             state,
-            post=os.dup(state.post),
-            page=os.dup(state.page or 0),
+            channel=os.dup(state.channel),
+            memory=os.dup(state.memory or 0),
             links=tuple(msgspec.structs.replace(link, stream=os.dup(link.stream or 0)) for link in state.links),
         )
     )
     before.close()
     ours.close()
     assert (after.last, after.hands_over) == (LAST, True)
-    assert after.heart.state == before.heart.state
+    assert after.watchdog == before.watchdog
     assert after.deposit.duplicates.state[0].boundary == Boundary(outgoing=False)
-    kept, shared = after.deposit.kept, after.deposit.memory
+    kept, shared = after.deposit.deposited, after.deposit.memory
     assert kept is not None
     assert shared is not None
     assert (kept.sockets, shared.deposit(kept.area, kept.size)) == (((3, 0),), b"given")
     memory.cut(3, Partial(b"half"))
     assert shared.partial(3) == Partial(b"half"), "it sees the same memory"
-    told.send(Beat(LastStop(frames=(StopFrame(b"stop"),))))
-    after.hear()
-    after.deposit.duplicates.stands({3: Boundary()})
+    told.send(Heartbeat(LastStop(frames=(StopFrame(b"stop"),))))
+    after.receive()
+    after.deposit.duplicates.set_boundaries({3: Boundary()})
     assert await after.deposit.stop(1)
     assert robot.recv(100) == b"stop"
-    told.send(Beat(LastStop(state="offline")))
-    after.hear()
+    told.send(Heartbeat(LastStop(state="offline")))
+    after.receive()
     assert after.last.state == "offline", "it hears the same process"
     after.close()
     assert robot.recv(100) == b"", "nobody has a duplicate"
@@ -173,15 +181,15 @@ async def test_a_process_is_known_as_before_with_its_page_its_kept_state_and_the
 
 
 def runner() -> Runner:
-    return Runner(FILE, Forks(["false"]), verbose=False, changed=lambda: None)
+    return Runner(FILE, ForkClient(["false"]), verbose=False, changed=lambda: None)
 
 
 @pytest.fixture
-async def running() -> AsyncIterator[tuple[Runner, asyncio.Task[None], Post]]:
-    """A runner that was resumed with a process, and the process's end of the post."""
+async def running() -> AsyncIterator[tuple[Runner, asyncio.Task[None], FdChannel]]:
+    """A runner that was resumed with a process, and the process's end of the channel."""
     near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    made, end = runner(), Post(far)
-    process = ProcessState(NOBODY, near.detach(), 0.0, HeartState(0.0, 1.0), LAST)
+    made, end = runner(), FdChannel(far)
+    process = ProcessState(NOBODY, near.detach(), 0.0, Watchdog(0.0, 1.0), LAST)
     made.resume(RunnerState("r1.toml", b"", ("fleet", "r1"), 4, 2, process=process))
     task = asyncio.ensure_future(made.run())
     await asyncio.sleep(0)
@@ -194,19 +202,19 @@ async def running() -> AsyncIterator[tuple[Runner, asyncio.Task[None], Post]]:
 
 
 async def test_a_resumed_runner_keeps_its_process_and_its_counts(
-    running: tuple[Runner, asyncio.Task[None], Post],
+    running: tuple[Runner, asyncio.Task[None], FdChannel],
 ) -> None:
     made, _, _ = running
-    assert made.is_calm
-    kept = made.kept
+    assert made.is_idle
+    kept = made.snapshot
     assert (kept.restarts, kept.failures, kept.next_at) == (4, 2, None)
     assert kept.process is not None
     assert kept.process.pid == NOBODY
 
 
-@pytest.mark.parametrize("what", ["told_to_end", "killed", "restarting", "given"])
+@pytest.mark.parametrize("what", ["asked_to_end", "killed", "restarting", "given"])
 async def test_a_runner_with_something_under_way_is_not_calm(
-    running: tuple[Runner, asyncio.Task[None], Post], what: str
+    running: tuple[Runner, asyncio.Task[None], FdChannel], what: str
 ) -> None:
     made, _, _ = running
     assert made.process is not None
@@ -216,10 +224,10 @@ async def test_a_runner_with_something_under_way_is_not_calm(
         case "restarting":
             made._restarting = 1
         case "given":
-            made.process.deposit.given = Deposit()
+            made.process.deposit.predecessor = Deposit()
         case _:
             setattr(made.process, what, True)
-    assert not made.is_calm
+    assert not made.is_idle
 
 
 async def test_a_resumed_runner_waits_for_its_next_process_until_the_same_time() -> None:
@@ -227,8 +235,8 @@ async def test_a_resumed_runner_waits_for_its_next_process_until_the_same_time()
     made.resume(RunnerState("r1.toml", b"", ("fleet", "r1"), failures=6, next_at=at))
     task = asyncio.ensure_future(made.run())
     await asyncio.sleep(0)
-    assert made.is_calm
-    assert made.kept.next_at == at
+    assert made.is_idle
+    assert made.snapshot.next_at == at
     task.cancel()
     await asyncio.wait([task])
 
@@ -303,11 +311,11 @@ async def test_files_are_read_off_the_event_loop_which_watches_the_gateways(monk
     supervisor._code = "one"  # type: ignore[assignment]
     seen: list[bool] = []
 
-    def look(running: object, *, twice: bool) -> Changes:
+    def poll(running: object, *, twice: bool) -> Changes:
         seen.append(looked.wait(10.0))
         return Changes()
 
-    monkeypatch.setattr(supervisor._follower, "look", look)
+    monkeypatch.setattr(supervisor._follower, "poll", poll)
     supervisor._reload.set()
     following = asyncio.ensure_future(supervisor._follow())
     asyncio.get_running_loop().call_later(0.01, looked.set)  # never called while the loop reads files

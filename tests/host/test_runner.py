@@ -13,15 +13,15 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from zbridge.app.handover.channel import VERSION, Channel, EndError, Given, Go, Hello, Up
+from zbridge.app.handover.channel import VERSION, EndError, Go, HandoverChannel, HandoverState, Hello, Up
 from zbridge.errors import NotReady
 from zbridge.host import duplicates, succession
 from zbridge.host import runner as module
-from zbridge.host.fd_channel import Beat, Kept, Opened, Post, Shared, Started, Succeeded, WantSuccessor
+from zbridge.host.fd_channel import Deposited, FdChannel, Heartbeat, Opened, Shared, Started, Succeeded, WantSuccessor
 from zbridge.host.files import RobotFile, check
 from zbridge.host.memory import MemoryWriter
 from zbridge.host.process import GatewayProcess
-from zbridge.host.runner import KEPT_CRASHES, Runner
+from zbridge.host.runner import RESUMED_CRASHES, Runner
 from zbridge.robot.observer import LastStop, StopFrame
 from zbridge.wire.frames import Partial
 
@@ -34,14 +34,14 @@ class Child:
 
     def __init__(self, file: RobotFile, stream: socket.socket, take_over: int | None) -> None:
         self.file = file
-        self.post, self._far = Post.pair()
-        self._told, self._memory = Post(self._far), MemoryWriter()
+        self.channel, self._far = FdChannel.pair()
+        self._told, self._memory = FdChannel(self._far), MemoryWriter()
         self._stream = stream
-        self.channel = Channel(socket.socket(fileno=os.dup(take_over))) if take_over is not None else None
+        self.handover = HandoverChannel(socket.socket(fileno=os.dup(take_over))) if take_over is not None else None
         self.pid = os.posix_spawnp("sleep", ["sleep", "3600"], {}, setsigmask=[signal.SIGUSR2])
         self.tell(Shared(), self._memory.descriptor)
-        self._memory.sent()
-        self.tell(Beat(hands_over=True))
+        self._memory.close_descriptor()
+        self.tell(Heartbeat(hands_over=True))
 
     def tell(self, message: object, *descriptors: int) -> None:
         assert self._told.send(message, descriptors)  # type: ignore[arg-type]
@@ -58,17 +58,17 @@ class Child:
         self.tell(Opened(1, "robot"), self._stream.fileno())
 
     def deposits(self, what: str) -> None:
-        data = msgspec.msgpack.encode(Given(VERSION, {}, 1, device={"what": what}))
+        data = msgspec.msgpack.encode(HandoverState(VERSION, {}, 1, device={"what": what}))
         area = self._memory.deposit(data)
-        self.tell(Kept(((1, 0),), area, len(data)))
-        self._memory.told(area)
-        self.tell(Beat(STOP, hands_over=True))
+        self.tell(Deposited(((1, 0),), area, len(data)))
+        self._memory.commit(area)
+        self.tell(Heartbeat(STOP, hands_over=True))
 
     def dies(self) -> None:
         os.kill(self.pid, signal.SIGKILL)
         self._told.close()
-        if self.channel is not None:
-            self.channel.close()
+        if self.handover is not None:
+            self.handover.close()
 
     async def answer(self) -> Started:
         """Wait for the answer to what it asked for."""
@@ -84,35 +84,35 @@ class Child:
 
     async def takes_over(self) -> tuple[str, Partial]:
         """Say hello, take what is given, and say that it is up; give whose state it is, and where the stream stands."""
-        assert self.channel is not None
-        await self.channel.send(Hello(VERSION, self.pid))
-        given = await self.channel.receive(Given, SOON_S)
-        (await self.channel.receive_parcel(1, SOON_S)).close()
-        await self.channel.send(Up())
+        assert self.handover is not None
+        await self.handover.send(Hello(VERSION, self.pid))
+        given = await self.handover.receive(HandoverState, SOON_S)
+        (await self.handover.receive_parcel(1, SOON_S)).close()
+        await self.handover.send(Up())
         assert given.device is not None
         return given.device["what"], given.partials[0]
 
     async def goes(self) -> None:
-        assert self.channel is not None
-        await self.channel.receive(Go, SOON_S)
+        assert self.handover is not None
+        await self.handover.receive(Go, SOON_S)
 
     def close(self) -> None:
         with contextlib.suppress(ProcessLookupError, ChildProcessError):
             os.kill(self.pid, signal.SIGKILL)
             os.waitpid(self.pid, 0)
-        if self.post.fileno() >= 0:
-            asyncio.get_running_loop().remove_reader(self.post.fileno())
-            self.post.close()
+        if self.channel.fileno() >= 0:
+            asyncio.get_running_loop().remove_reader(self.channel.fileno())
+            self.channel.close()
         self._told.close()
         self._memory.close()
-        if self.channel is not None:
-            self.channel.close()
+        if self.handover is not None:
+            self.handover.close()
 
 
 class PlayedLauncher:
     """Starts children; keeps all of them, and the files that they run by."""
 
-    def __init__(self, make: Callable[[int, Post, RobotFile], GatewayProcess], stream: socket.socket) -> None:
+    def __init__(self, make: Callable[[int, FdChannel, RobotFile], GatewayProcess], stream: socket.socket) -> None:
         self.children: list[Child] = []
         self.refuses: list[NotReady] = []
         self._make, self._stream = make, stream
@@ -121,7 +121,7 @@ class PlayedLauncher:
         if self.refuses:
             raise self.refuses.pop()
         self.children.append(child := Child(file, self._stream, take_over))
-        return self._make(child.pid, child.post, file)
+        return self._make(child.pid, child.channel, file)
 
 
 class Scene:
@@ -210,7 +210,7 @@ async def test_the_robot_of_a_process_that_died_is_stopped_first_and_keeps_its_c
     await second.goes()
     assert scene.read() == 4 * b"stop."
     second.serves("second")
-    await scene.until(lambda: scene.runner.is_calm)
+    await scene.until(lambda: scene.runner.is_idle)
     assert scene.runner.restarts == 1
 
 
@@ -259,7 +259,7 @@ async def test_a_successor_that_dies_at_the_word_to_go_has_crashed_though_its_en
     first.serves("first")
     second = await scene.successor(first)
     assert scene.runner.process is not None
-    asyncio.get_running_loop().remove_reader(scene.runner.process.post.fileno())  # its word is heard late
+    asyncio.get_running_loop().remove_reader(scene.runner.process.channel.fileno())  # its word is heard late
     first.tell(Succeeded())
     second.dies()
     third = await scene.child(2)
@@ -272,7 +272,7 @@ async def test_a_successor_that_ends_before_it_has_the_robot_changes_nothing(sce
     first = await scene.child(0)
     first.serves("first")
     (await scene.successor(first)).dies()
-    await scene.until(lambda: scene.runner.is_calm)
+    await scene.until(lambda: scene.runner.is_idle)
     assert scene.runner.process is not None
     assert scene.runner.process.pid == first.pid
     assert scene.read() == b"nothing"
@@ -302,7 +302,7 @@ async def test_a_process_that_has_handed_over_is_no_crash_whatever_becomes_of_it
     first.tell(Succeeded())
     first.dies()
     second.serves("second")
-    await scene.until(lambda: scene.runner.is_calm)
+    await scene.until(lambda: scene.runner.is_idle)
     assert scene.runner.process is not None
     assert scene.runner.process.pid == second.pid
     assert scene.read() == b"nothing"
@@ -312,7 +312,7 @@ async def test_a_process_that_has_handed_over_is_no_crash_whatever_becomes_of_it
 async def test_the_third_crash_in_a_row_is_the_last_one_that_keeps_the_connection(scene: Scene) -> None:
     child = await scene.child(0)
     child.serves("0")
-    for number in range(1, KEPT_CRASHES + 1):
+    for number in range(1, RESUMED_CRASHES + 1):
         child.dies()
         child = await scene.child(number)
         await child.takes_over()
@@ -321,7 +321,7 @@ async def test_the_third_crash_in_a_row_is_the_last_one_that_keeps_the_connectio
     scene.stream.close()
     child.dies()
     await scene.until(lambda: scene.read() == b"")
-    assert (await scene.child(KEPT_CRASHES + 1)).channel is None, "it connects anew"
+    assert (await scene.child(RESUMED_CRASHES + 1)).handover is None, "it connects anew"
 
 
 async def test_after_a_crash_the_robot_is_served_by_the_content_that_ran_whatever_the_file_holds(
@@ -417,7 +417,7 @@ async def test_a_successor_that_the_supervisor_has_no_descriptor_for_is_refused_
 async def test_a_file_that_changes_while_its_process_dies_restarts_the_process_that_goes_on(scene: Scene) -> None:
     first = await scene.child(0)
     first.serves("first")
-    await scene.until(lambda: scene.runner.process is not None and scene.runner.process.deposit.kept is not None)
+    await scene.until(lambda: scene.runner.process is not None and scene.runner.process.deposit.deposited is not None)
     changed = msgspec.structs.replace(scene.runner.file, content=b"changed")
     restarting = asyncio.ensure_future(scene.runner.restart(changed))
     await asyncio.sleep(0)
@@ -441,7 +441,7 @@ async def test_a_runner_without_free_descriptors_stops_the_robot_and_tries_again
 ) -> None:
     first = await scene.child(0)
     first.serves("first")
-    await scene.until(lambda: scene.runner.process is not None and scene.runner.process.deposit.kept is not None)
+    await scene.until(lambda: scene.runner.process is not None and scene.runner.process.deposit.deposited is not None)
 
     def fail(*_: object) -> object:
         raise OSError(24, "Too many open files")
@@ -454,4 +454,4 @@ async def test_a_runner_without_free_descriptors_stops_the_robot_and_tries_again
     await scene.until(lambda: scene.runner._next_at is not None)
     monkeypatch.undo()
     assert scene.read() == 4 * b"stop."
-    assert (await scene.child(1)).channel is None
+    assert (await scene.child(1)).handover is None

@@ -1,4 +1,4 @@
-"""The supervisor of several robots, whose runners are played: files, hearts, the status line, and systemd."""
+"""The supervisor of several robots, whose runners are played: files, watchdogs, the status line, and systemd."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from zbridge.host.files import Changes, RobotFile
 from zbridge.host.replacement import VERSION, RunnerState
 from zbridge.host.settings import HostSettings
 from zbridge.host.supervisor import LATE_S, READY_S, STATUS_S, Supervisor
-from zbridge.host.watchdog import DRIVEN_S, EXCUSED_S, IDLE_S, Heart
+from zbridge.host.watchdog import DRIVEN_S, EXTENSION_S, IDLE_S, Watchdog
 
 pytestmark = pytest.mark.jumping
 
@@ -26,19 +26,19 @@ def file(name: str, content: bytes = b"", **fields: Any) -> RobotFile:
 
 
 class Process:
-    """A gateway process whose heart the test has."""
+    """A gateway process whose watchdog the test has."""
 
     def __init__(self, now: float = 0.0) -> None:
-        self.heart = Heart(now)
+        self.watchdog = Watchdog(now)
         self.over: asyncio.Future[int] = asyncio.get_running_loop().create_future()
         self.killed: list[str] = []
-        self.beats = False
+        self.heartbeats = False
         self.now = now
 
-    def hear(self) -> None:
+    def receive(self) -> None:
         """Take a beat that has arrived meanwhile."""
-        if self.beats:
-            self.heart.beat(self.now, driven=False)
+        if self.heartbeats:
+            self.watchdog.heartbeat(self.now, driven=False)
 
     def reap(self) -> None:
         """It is alive."""
@@ -55,7 +55,7 @@ class Runner:
         self.done: list[Any] = []
         self.state = "down"
         self.restarts = 0
-        self.is_calm = True
+        self.is_idle = True
         self.process: Process | None = None
         self.goes = asyncio.Event()
         self.goes.set()
@@ -65,7 +65,7 @@ class Runner:
         return (self.process,) if self.process is not None else ()
 
     @property
-    def kept(self) -> RunnerState:
+    def snapshot(self) -> RunnerState:
         return RunnerState(str(self.file.path), self.file.content, self.file.identity)
 
     async def run(self) -> None:
@@ -92,7 +92,7 @@ class Systemd:
         return self.hears
 
 
-class Forks:
+class ForkClient:
     stamp: str | None = "one"
     refused = unsettled = False
     state = (None, (7,))
@@ -108,7 +108,7 @@ class Scene:
         monkeypatch.setattr(module, "time", clock)
         self.supervisor = Supervisor((), HostSettings(stagger_s=stagger_s), [], watch=watch, verbose=False)
         self.supervisor._runner = Runner  # type: ignore[assignment, method-assign]
-        self.supervisor._forks, self.supervisor._code = Forks(), "one"  # type: ignore[assignment]
+        self.supervisor._forks, self.supervisor._code = ForkClient(), "one"  # type: ignore[assignment]
         self.supervisor._systemd = self.systemd = Systemd()  # type: ignore[assignment]
 
     def runner(self, name: str) -> Any:
@@ -118,21 +118,21 @@ class Scene:
         await self.supervisor._apply(Changes(**changes))
         await asyncio.sleep(0)
 
-    def look(self, now: float) -> float:
-        """Look at the hearts at this time; give when they are looked at next."""
+    def poll(self, now: float) -> float:
+        """Check the watchdogs at this time; give when they are checked next."""
         self.now = now
-        self.supervisor._look_at_hearts()
+        self.supervisor._check_watchdogs()
         assert self.supervisor._timer is not None
         self.supervisor._timer.cancel()
-        return self.supervisor._look_at
+        return self.supervisor._check_at
 
 
 @pytest.fixture
 async def scene(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Scene]:
     made = Scene(monkeypatch)
     yield made
-    if made.supervisor._told is not None:
-        made.supervisor._told.cancel()
+    if made.supervisor._status_timer is not None:
+        made.supervisor._status_timer.cancel()
 
 
 # Files
@@ -161,7 +161,7 @@ async def test_faulty_files_are_counted_until_they_are_sound_or_gone(scene: Scen
     await scene.apply(came=(file("r1"),))
     await scene.apply(faulty=(file("r1", fault="colour"), file("r2", fault="taste"), file("r3", fault="smell")))
     assert scene.supervisor.status == "1 robots, 1 down, 3 faulty files"
-    assert scene.runner("r1").done == ["run"], "its robot goes on as before"
+    assert scene.runner("r1").done == ["run"], "its robot continues as before"
     await scene.apply(changed=(file("r1"),), came=(file("r2"),))
     assert scene.supervisor.status == "2 robots, 2 down, 1 faulty files"
 
@@ -181,7 +181,7 @@ async def test_files_are_read_again_at_sighup_and_systemd_is_told(
 ) -> None:
     looks: list[bool] = []
 
-    def look(running: dict[Path, RobotFile], *, twice: bool) -> Changes:
+    def poll(running: dict[Path, RobotFile], *, twice: bool) -> Changes:
         looks.append(twice)
         if len(looks) > 1:
             raise ConfigError("two files name one robot")
@@ -190,7 +190,7 @@ async def test_files_are_read_again_at_sighup_and_systemd_is_told(
     async def inline(work: Any, *arguments: Any, **named: Any) -> Any:
         return work(*arguments, **named)
 
-    monkeypatch.setattr(scene.supervisor._follower, "look", look)
+    monkeypatch.setattr(scene.supervisor._follower, "poll", poll)
     monkeypatch.setattr(asyncio, "to_thread", inline)
     following = asyncio.ensure_future(scene.supervisor._follow())
     await asyncio.sleep(100.0)
@@ -207,48 +207,48 @@ async def test_files_are_read_again_at_sighup_and_systemd_is_told(
     await asyncio.wait([following])
 
 
-# Hearts
+# Watchdogs
 
 
 async def test_a_process_that_is_silent_for_too_long_is_killed_and_the_next_deadline_awaited(scene: Scene) -> None:
     await scene.apply(came=(file("r1"), file("r2")))
     driven, idle = Process(), Process()
     scene.runner("r1").process, scene.runner("r2").process = driven, idle
-    driven.heart.beat(100.0, driven=True)
-    idle.heart.beat(100.0, driven=False)
-    assert scene.look(100.0) == pytest.approx(100.0 + DRIVEN_S)
-    scene.look(100.0 + DRIVEN_S)
+    driven.watchdog.heartbeat(100.0, driven=True)
+    idle.watchdog.heartbeat(100.0, driven=False)
+    assert scene.poll(100.0) == pytest.approx(100.0 + DRIVEN_S)
+    scene.poll(100.0 + DRIVEN_S)
     assert driven.killed == [f"gave no sign of life for {DRIVEN_S} s"]
     driven.over.set_result(9)
-    assert scene.look(101.0) == 102.0, "once a second at least"
+    assert scene.poll(101.0) == 102.0, "once a second at least"
     assert idle.killed == []
-    scene.supervisor._look_at = 100.0 + IDLE_S
-    scene.look(100.0 + IDLE_S)
+    scene.supervisor._check_at = 100.0 + IDLE_S
+    scene.poll(100.0 + IDLE_S)
     assert (len(driven.killed), len(idle.killed)) == (1, 1)
 
 
 async def test_what_a_process_told_before_it_is_looked_at_counts(scene: Scene) -> None:
     await scene.apply(came=(file("r1"),))
     scene.runner("r1").process = process = Process()
-    process.heart.beat(100.0, driven=True)
-    process.beats, process.now = True, 100.0 + DRIVEN_S
-    scene.supervisor._look_at = 100.0 + DRIVEN_S
-    scene.look(100.0 + DRIVEN_S)
+    process.watchdog.heartbeat(100.0, driven=True)
+    process.heartbeats, process.now = True, 100.0 + DRIVEN_S
+    scene.supervisor._check_at = 100.0 + DRIVEN_S
+    scene.poll(100.0 + DRIVEN_S)
     assert process.killed == []
 
 
 @pytest.mark.parametrize(
     ("late_s", "killed"),
-    [(LATE_S - 0.01, True), (LATE_S + 0.01, False), (EXCUSED_S - 0.01, False), (EXCUSED_S + 0.01, True)],
+    [(LATE_S - 0.01, True), (LATE_S + 0.01, False), (EXTENSION_S - 0.01, False), (EXTENSION_S + 0.01, True)],
 )
 async def test_a_supervisor_that_was_held_up_itself_waits_a_little_longer(
     scene: Scene, late_s: float, killed: bool
 ) -> None:
     await scene.apply(came=(file("r1"),))
     scene.runner("r1").process = process = Process()
-    process.heart.beat(100.0, driven=True)
-    scene.supervisor._look_at = 100.0 + DRIVEN_S
-    scene.look(100.0 + DRIVEN_S + late_s)
+    process.watchdog.heartbeat(100.0, driven=True)
+    scene.supervisor._check_at = 100.0 + DRIVEN_S
+    scene.poll(100.0 + DRIVEN_S + late_s)
     assert bool(process.killed) is killed
 
 
@@ -258,9 +258,9 @@ async def test_a_process_of_a_robot_whose_file_is_gone_is_watched_until_it_has_e
     runner.process = process = Process()
     runner.goes.clear()
     await scene.apply(gone=(Path("r1.toml"),))
-    process.heart.beat(100.0, driven=True)
-    scene.supervisor._look_at = 101.0
-    scene.look(101.0)
+    process.watchdog.heartbeat(100.0, driven=True)
+    scene.supervisor._check_at = 101.0
+    scene.poll(101.0)
     assert process.killed
     assert scene.supervisor._snapshot() is None
     runner.goes.set()
@@ -287,7 +287,7 @@ async def test_the_service_is_ready_once_when_every_gateway_has_beaten(scene: Sc
         await asyncio.sleep(READY_S + 0.01)
         assert "READY=1" not in scene.systemd.told
         scene.runner(name).process = Process()
-        scene.runner(name).process.heart.beat(0.0, driven=False)
+        scene.runner(name).process.watchdog.heartbeat(0.0, driven=False)
     scene.systemd.hears = False
     scene.supervisor._state_changed()
     await asyncio.sleep(READY_S + 0.01)
@@ -334,7 +334,7 @@ async def test_everything_is_kept_for_the_code_in_its_place_when_nothing_is_unde
     assert (state.version, state.at, state.leaving) == (VERSION, 100.0, (7,))
     assert [(each.path, each.content) for each in state.runners] == [("r1.toml", b"one")]
     assert state.faults == {"r2.toml": "colour"}, "a name that cannot be written is looked at anew"
-    scene.runner("r1").is_calm = False
+    scene.runner("r1").is_idle = False
     assert supervisor._snapshot() is None
-    scene.runner("r1").is_calm, supervisor._ends = True, True
+    scene.runner("r1").is_idle, supervisor._ends = True, True
     assert supervisor._snapshot() is None

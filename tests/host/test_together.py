@@ -9,7 +9,7 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from zbridge.app import Plan, plan
+from zbridge.app import GatewayPlan, plan
 from zbridge.app.gateway import Gateway, Neighbourhood
 from zbridge.bus import Bus
 from zbridge.bus.fake import FakeBus
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.jumping
 NAMES = ("r1", "r2", "r3")
 
 
-def planned(name: str) -> Plan:
+def planned(name: str) -> GatewayPlan:
     return plan({"robot": {"name": name}, "device": {"protocol": "tcpudp", "connect": ["tcp://127.0.0.1:1"]}})
 
 

@@ -15,7 +15,7 @@ from zbridge.security.access import (
     NEEDED,
     STOPS_HZ,
     Keys,
-    Kind,
+    MessageKind,
     access_control,
     column,
     downsampling,
@@ -44,8 +44,8 @@ def test_every_role_has_its_grants() -> None:
 
 def test_nobody_but_a_router_deletes_and_every_person_may_stop() -> None:
     allowed = granted_by_the_code()
-    assert {each.column for each in allowed if each.kind is Kind.DELETE} == {"router"}
-    stops = {(each.column, each.robot) for each in allowed if each.path == "@cmd/stop" and each.kind is Kind.PUT}
+    assert {each.column for each in allowed if each.kind is MessageKind.DELETE} == {"router"}
+    stops = {(each.column, each.robot) for each in allowed if each.path == "@cmd/stop" and each.kind is MessageKind.PUT}
     for role in ("viewer", "operator", "supervisor"):
         assert {(role, OWN), (role, OTHER)} <= stops
     assert {"gateway", "recorder"} & {role for role, _ in stops} == set()
@@ -56,18 +56,18 @@ def test_who_names_robots_gets_nothing_of_others_but_a_gateway_asks_them_for_the
     of_others = {
         (each.path, each.kind) for each in granted_by_the_code() if each.column == role and each.robot == OTHER
     }
-    assert of_others == ({("@rpc/latch", Kind.QUERY)} if role == "gateway" else set())
+    assert of_others == ({("@rpc/latch", MessageKind.QUERY)} if role == "gateway" else set())
 
 
 def test_expressions_are_of_the_realm_the_name_and_the_robots() -> None:
     of_hq = granted("h1", Member("hq", ("r1", "r2")), "lab")
-    assert of_hq[Kind.TOKEN,] == (
+    assert of_hq[MessageKind.TOKEN,] == (
         "lab/r1/@alive/operator.h1.$*",
         "lab/r2/@alive/operator.h1.$*",
         "lab/r1/@alive/hq.h1.$*",
         "lab/r2/@alive/hq.h1.$*",
     )
-    assert granted("v1", Member("viewer"), "lab")[Kind.SUBSCRIBE, Kind.QUERY] == ("lab/**",)
+    assert granted("v1", Member("viewer"), "lab")[MessageKind.SUBSCRIBE, MessageKind.QUERY] == ("lab/**",)
 
 
 def test_zenoh_takes_the_rules() -> None:
@@ -86,7 +86,7 @@ def test_all_is_denied_that_no_rule_allows_and_no_rule_denies() -> None:
 
 def test_one_egress_rule_for_all_members_passes_whatever_an_ingress_rule_passes() -> None:
     (egress,) = EGRESS
-    assert egress["messages"] == [kind.value for kind in Kind]
+    assert egress["messages"] == [kind.value for kind in MessageKind]
     wide = [zenoh.KeyExpr(each) for each in egress["key_exprs"]]
     for rule in INGRESS:
         for key_expr in rule["key_exprs"]:

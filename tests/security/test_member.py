@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from zbridge.app.config import Plan, load
+from zbridge.app.config import GatewayPlan, load
 from zbridge.app.joining import ENDED_S, RARELY_S, RETRY_S, CertificateEnded, Pauses, watch_certificate
 from zbridge.bus.fake import FakeBus
 from zbridge.bus.tls.certificate import Certificate
 from zbridge.control.conditions import Conditions
 from zbridge.errors import BusError, BusRefused, ConfigError
 from zbridge.security.certs import authority
-from zbridge.security.certs.authority import Request
+from zbridge.security.certs.authority import CertificateRequest
 from zbridge.security.certs.files import Folder
 from zbridge.security.member import check_member
 from zbridge.security.roles import Member
@@ -37,11 +37,11 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Folder:
     folder = Folder(tmp_path_factory.mktemp("lab") / "certs")
     authority.init(folder, NOW)
     for name, member in MEMBERS.items():
-        authority.issue(folder, Request(name, member, ("hub.lab",) if name == "hub" else ()), NOW)
+        authority.issue(folder, CertificateRequest(name, member, ("hub.lab",) if name == "hub" else ()), NOW)
     return folder
 
 
-def planned(tmp_path: Path, lab: Folder, name: str, parts: str = DEVICE) -> Plan:
+def planned(tmp_path: Path, lab: Folder, name: str, parts: str = DEVICE) -> GatewayPlan:
     file = tmp_path / "r1.toml"
     file.write_text(f'[robot]\nname = "r1"\n{parts}[bus]\nconnect = ["tls/hub.lab:7447"]\n')
     return load(file, {}, tls=lab.of(name).folder)

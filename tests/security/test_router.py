@@ -102,7 +102,7 @@ def test_a_warning_that_repeats_is_logged_once_and_counted(caplog: pytest.LogCap
     warnings.take(HEAD + LINES[0][0])
     assert [record.getMessage().rpartition(", or a clock is wrong")[2] for record in caplog.records] == [
         "",
-        " (99 times more since it was last said)",
+        " (99 times more since it was last logged)",
     ]
 
 

@@ -59,7 +59,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     camera: CameraSettings | None = None
 
 
-class Plan(msgspec.Struct, frozen=True):
+class GatewayPlan(msgspec.Struct, frozen=True):
     """A configuration with the protocols, options and addresses that it names: what a gateway starts from."""
 
     config: Config
@@ -84,7 +84,7 @@ def load(
     *,
     tls: Path | None = None,
     content: bytes | None = None,
-) -> Plan:
+) -> GatewayPlan:
     """Read and check a configuration file; raise ConfigError, which names the file as well.
 
     tls: a folder as ``zbridge certs bundle`` makes it, for a file without ``bus.tls``; so does ``ZBRIDGE_TLS``. Paths
@@ -114,7 +114,7 @@ def _secured(bus: BusSettings, beside: Path, tls: Path | None, variable: str | N
     return msgspec.structs.replace(bus, connect=given.connect, tls=given.tls)
 
 
-def plan(raw: dict[str, Any], environment: Mapping[str, str] = os.environ) -> Plan:
+def plan(raw: dict[str, Any], environment: Mapping[str, str] = os.environ) -> GatewayPlan:
     """Check a configuration given as a dict; raise ConfigError."""
     raw = _substituted(raw, environment, "")
     config = convert(raw, Config, "")
@@ -137,7 +137,7 @@ def plan(raw: dict[str, Any], environment: Mapping[str, str] = os.environ) -> Pl
     camera = plan_camera(config.camera) if config.camera is not None else None
     if camera is not None and device is None:
         raise ConfigError("camera: expected only where there is a table device")
-    return Plan(config, device, listeners, metrics, camera)
+    return GatewayPlan(config, device, listeners, metrics, camera)
 
 
 def _device(settings: DeviceSettings) -> DevicePlan:

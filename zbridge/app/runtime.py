@@ -15,7 +15,7 @@ from pathlib import Path
 
 import msgspec
 
-from zbridge.app.config import Plan
+from zbridge.app.config import GatewayPlan
 from zbridge.app.handover.processes import PROCESSES, Processes
 from zbridge.app.joining import join_bus
 from zbridge.bus import Bus
@@ -44,7 +44,7 @@ class Runtime(msgspec.Struct, frozen=True):
     kernel: Kernel = KERNEL
     folder: Path | None = None
     processes: Processes = PROCESSES
-    join: Callable[[Plan, Metrics], Awaitable[Bus]] = join_bus
+    join: Callable[[GatewayPlan, Metrics], Awaitable[Bus]] = join_bus
 
 
 RUNTIME = Runtime()
@@ -52,7 +52,7 @@ RUNTIME = Runtime()
 
 
 @contextlib.contextmanager
-def open_audit(plan: Plan, metrics: Metrics, conditions: Conditions) -> Iterator[Audit]:
+def open_audit(plan: GatewayPlan, metrics: Metrics, conditions: Conditions) -> Iterator[Audit]:
     """Open the audit log: the file that the configuration names, else the process's log at DEBUG."""
     control, name = plan.config.control, plan.config.robot.name
     if control.audit is None or plan.device is None:
@@ -60,7 +60,7 @@ def open_audit(plan: Plan, metrics: Metrics, conditions: Conditions) -> Iterator
         return
     loop = asyncio.get_running_loop()
 
-    def tell(text: str | None) -> None:
+    def report(text: str | None) -> None:
         with contextlib.suppress(RuntimeError):  # the loop has ended
             loop.call_soon_threadsafe(conditions.set, "audit", text)
 
@@ -70,7 +70,7 @@ def open_audit(plan: Plan, metrics: Metrics, conditions: Conditions) -> Iterator
         file_bytes=control.audit_bytes,
         files=control.audit_files,
         days=control.audit_days,
-        tell=tell,
+        tell=report,
     )
     audit = Audit(name, file.write)
     try:

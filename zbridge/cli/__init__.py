@@ -108,7 +108,7 @@ def run_gateway(
 
     async def work() -> None:
         if reporter is not None:
-            reporter.keep = gateway.restarts.keep
+            reporter.describe = gateway.restarts.deposit
             reporter.begin()
         await until_signal(serve(), {signal.SIGUSR2: gateway.restarts.restart})
 

@@ -17,7 +17,7 @@ from zbridge.fleet.printable import as_json, shown
 from zbridge.security.roles import OF_ROBOTS, ROLES, Member, load_roles
 
 if TYPE_CHECKING:
-    from zbridge.security.certs.authority import Entry, Issued
+    from zbridge.security.certs.authority import Issued, ListedCertificate
     from zbridge.security.certs.files import Folder
 
 app = typer.Typer(
@@ -76,7 +76,7 @@ def issue(
 ) -> None:
     """Make the key and the certificate of a name, and write the name into roles.toml."""
     folder = opened(directory)
-    from zbridge.security.certs.authority import Request
+    from zbridge.security.certs.authority import CertificateRequest
     from zbridge.security.certs.authority import issue as make
 
     if role not in ROLES:
@@ -84,7 +84,7 @@ def issue(
     if listeners and role != "gateway":
         raise ConfigError(f"--listeners: a gateway's; the role {role} has none")
     member = Member(role, tuple(robot or ()), listeners)
-    issued = make(folder, Request(name, member, tuple(host or ()), days), now(), force=force)
+    issued = make(folder, CertificateRequest(name, member, tuple(host or ()), days), now(), force=force)
     say_issued(folder, name, issued)
     if issued.replaced_until is not None:
         say(
@@ -200,7 +200,7 @@ def say_issued(folder: Folder, name: str, issued: Issued) -> None:
     say(f"{folder.of(name).folder}: {issued.common_name}, expires {issued.expires:%Y-%m-%d}, {issued.fingerprint}")
 
 
-def _fields(entry: Entry) -> dict[str, object]:
+def _fields(entry: ListedCertificate) -> dict[str, object]:
     return {
         "name": entry.name,
         "role": entry.role,
@@ -212,7 +212,7 @@ def _fields(entry: Entry) -> dict[str, object]:
     }
 
 
-def _print_table(entries: list[Entry]) -> None:
+def _print_table(entries: list[ListedCertificate]) -> None:
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text

@@ -87,7 +87,7 @@ def make_members(folder: Path, endpoint: str, gateways: dict[str, str]) -> Path:
     authority.init(made, now)
     for name, member in members.items():
         hosts = ("127.0.0.1",) if member.role == "router" else ()
-        authority.issue(made, authority.Request(name, member, hosts, DAYS), now)
+        authority.issue(made, authority.CertificateRequest(name, member, hosts, DAYS), now)
     for name in members:
         bundle(made, name, Packing(folder / name, (endpoint,)), now)
     return folder / _ROUTER / "roles.toml"

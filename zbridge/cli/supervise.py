@@ -10,7 +10,7 @@ from pathlib import Path
 from zbridge.app import until_signal
 from zbridge.cli import set_up_log
 from zbridge.errors import ConfigError
-from zbridge.host.forks import fork_server_command, module_command
+from zbridge.host.fork_client import fork_server_command, module_command
 from zbridge.host.replacement import restore
 from zbridge.host.settings import HostSettings, load_host
 from zbridge.host.supervisor import Supervisor

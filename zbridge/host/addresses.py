@@ -4,7 +4,7 @@ Theory of operation. A gateway binds a Unix socket in Linux's abstract namespace
 and the robot (:class:`AddressLock`). Nobody talks to it: names are read from ``/proc/self/net/unix``. The kernel takes
 the name back with the process, however it ends, and two network namespaces, in which one address means two robots, do
 not see each other's names. Two gateways of one robot name may hold an address: an owner and its standby, or a gateway
-and its successor. Two robot names may where both say ``allow_shared_address``.
+and its successor. Two robot names may where both set ``allow_shared_address``.
 
 Not locked: routers to which many robots are connected, and port 0. Not seen: other machines, a serial line that is used
 from two network namespaces, one robot by two of its addresses. Any user of the machine can bind such a name.
@@ -27,7 +27,7 @@ from pathlib import Path
 
 import msgspec
 
-from zbridge.app.config import Plan
+from zbridge.app.config import GatewayPlan
 from zbridge.errors import ConfigError
 from zbridge.protocol.address import Address, DeviceAddress, SerialAddress
 from zbridge.robot.settings import DevicePlan
@@ -51,7 +51,7 @@ _ANY = {"0.0.0.0": "127.0.0.1", "::": "::1"}
 """What the kernel makes of an address that means none."""
 
 
-class Holder(msgspec.Struct, frozen=True):
+class AddressHolder(msgspec.Struct, frozen=True):
     """A gateway that holds an address. robot: ``<realm>/<name>``, shortened where it is very long."""
 
     robot: str
@@ -139,7 +139,7 @@ class Addresses:
 
 
 @contextlib.asynccontextmanager
-async def hold_addresses(plan: Plan) -> AsyncIterator[None]:
+async def hold_addresses(plan: GatewayPlan) -> AsyncIterator[None]:
     """Hold the addresses of a plan's robot while the context lasts; raise ConfigError if another robot's gateway does.
 
     One that is just leaving is waited for, :data:`LEAVE_S` at most.
@@ -159,7 +159,7 @@ async def hold_addresses(plan: Plan) -> AsyncIterator[None]:
         yield
 
 
-def require_free(plan: Plan) -> None:
+def require_free(plan: GatewayPlan) -> None:
     """Raise ConfigError if a gateway of this machine serves the address of a plan's robot under another name."""
     robot = f"{plan.config.robot.realm}/{plan.config.robot.name}"
     for form in sorted(forms_of(plan.device)) if plan.device is not None else ():
@@ -172,7 +172,7 @@ def forms_of(device: DevicePlan) -> frozenset[str]:
     return frozenset[str]().union(*resolve(device.addresses).values())
 
 
-def refused(plan: Plan, other: Holder) -> ConfigError:
+def refused(plan: GatewayPlan, other: AddressHolder) -> ConfigError:
     """Make the error that names who has the address."""
     connect = plan.config.device.connect if plan.config.device is not None else ()
     return ConfigError(
@@ -192,7 +192,7 @@ class AddressLock:
     def __repr__(self) -> str:
         return f"<AddressLock of {self._robot}, {len(self._sockets)} addresses>"
 
-    def take(self, forms: Iterable[str]) -> Holder | None:
+    def take(self, forms: Iterable[str]) -> AddressHolder | None:
         """Hold these addresses, in all their forms; return who else holds one: then nothing is held."""
         with _guarded():
             wanted = list(forms)
@@ -207,7 +207,7 @@ class AddressLock:
             self._sockets.pop().close()
 
 
-def rival(form: str, robot: str, *, shares: bool) -> Holder | None:
+def rival(form: str, robot: str, *, shares: bool) -> AddressHolder | None:
     """Return who holds an address for another robot; None: it is free. robot: ``<realm>/<name>``."""
     mine = _shortened(robot)
     for holder in holders(form):
@@ -216,7 +216,7 @@ def rival(form: str, robot: str, *, shares: bool) -> Holder | None:
     return None
 
 
-def holders(form: str) -> list[Holder]:
+def holders(form: str) -> list[AddressHolder]:
     """List who holds an address; nobody where the kernel does not tell."""
     begin, found = f"@{_PREFIX}{_digest(form)}/", []
     try:
@@ -226,7 +226,7 @@ def holders(form: str) -> list[Holder]:
     for line in lines:
         match line.partition(begin)[2].split("/", 3):
             case [mode, pid, _, robot] if pid.isdecimal():
-                found.append(Holder(robot, int(pid), mode == "s"))
+                found.append(AddressHolder(robot, int(pid), mode == "s"))
     return found
 
 

@@ -14,9 +14,10 @@ import socket
 import stat
 from collections.abc import Sequence
 
+import msgspec
+
 from zbridge.host.fd_channel import close_all
 from zbridge.host.memory import SLOTS
-from zbridge.host.replacement import LinkState
 from zbridge.robot.observer import Boundary, LastStop
 
 log = logging.getLogger("zbridge.host")
@@ -31,54 +32,40 @@ _READS, _READ_BYTES = 32, 65_536
 """How much is read away at a time."""
 
 
-class Duplicate:
-    """The sockets of one link: its stream, and its datagrams where there are any."""
+class Duplicate(msgspec.Struct):
+    """The sockets of one link: descriptors of its stream, and of its datagrams where there are any."""
 
-    def __init__(self, name: str, *, drives: bool) -> None:
-        self.name = name
-        self.drives = drives
-        self.boundary = Boundary()
-        self._stream: int | None = None
-        self._datagrams: int | None = None
+    link: int
+    name: str
+    drives: bool
+    boundary: Boundary = Boundary()
+    stream: int | None = None
+    datagrams: int | None = None
 
-    def __repr__(self) -> str:
-        return f"<Duplicate {self.name}>"
-
-    @classmethod
-    def of(cls, state: LinkState) -> Duplicate:
-        """Make one of descriptors that are open already."""
-        duplicate = cls(state.name, drives=state.drives)
-        duplicate.boundary, duplicate._stream, duplicate._datagrams = state.boundary, state.stream, state.datagrams
-        return duplicate
-
-    def state(self, link: int) -> LinkState:
-        """Give what :meth:`of` needs; ``link``: its number."""
-        return LinkState(link, self.name, self.drives, self.boundary, self._stream, self._datagrams)
-
-    def take(self, descriptors: Sequence[int]) -> None:
-        """Keep descriptors: the stream's first, then the one of datagrams; those before are closed."""
+    def set_descriptors(self, descriptors: Sequence[int]) -> None:
+        """Set the descriptors: the stream's first, then the one of datagrams; those before are closed."""
         self.close()
-        self._stream, self._datagrams = (*descriptors, None, None)[:2]
+        self.stream, self.datagrams = (*descriptors, None, None)[:2]
         close_all(descriptors[2:])
 
     def descriptor(self, at: int) -> int | None:
         """Give the stream's descriptor (0), or that of datagrams (1)."""
-        return (self._stream, self._datagrams)[at] if at in (0, 1) else None
+        return (self.stream, self.datagrams)[at] if at in (0, 1) else None
 
     def close(self) -> None:
         """Close the duplicates; idempotent."""
-        close_all([number for number in (self._stream, self._datagrams) if number is not None])
-        self._stream = self._datagrams = None
+        close_all([number for number in (self.stream, self.datagrams) if number is not None])
+        self.stream = self.datagrams = None
 
-    def read_away(self) -> None:
-        """Read what waits, and forget it."""
-        if self._stream is not None and stat.S_ISSOCK(os.fstat(self._stream).st_mode):
-            with _borrowed(self._stream) as stream, contextlib.suppress(OSError):
+    def discard_input(self) -> None:
+        """Read what waits, and discard it."""
+        if self.stream is not None and stat.S_ISSOCK(os.fstat(self.stream).st_mode):
+            with _borrowed(self.stream) as stream, contextlib.suppress(OSError):
                 for _ in range(_READS):
                     stream.recv(_READ_BYTES, socket.MSG_DONTWAIT)
 
     async def stop(self, last: LastStop, times: int) -> bool:
-        """Write the stop so often; False where the link takes nothing.
+        """Write the stop so often; False where the link is stalled.
 
         The first frame waits for one gap: the dead process may have written a moment ago.
         """
@@ -92,7 +79,7 @@ class Duplicate:
         return True
 
     def _write(self, data: bytes, *, datagram: bool) -> bool:
-        stream = self._stream
+        stream = self.stream
         if stream is None or not self.boundary.outgoing:
             return False
         try:
@@ -105,9 +92,9 @@ class Duplicate:
 
     def _send_datagram(self, stream: int, data: bytes) -> bool:
         """Send to where the stream leads: a robot takes datagrams at the same address and port."""
-        if self._datagrams is None:
+        if self.datagrams is None:
             return False
-        with _borrowed(stream) as robot, _borrowed(self._datagrams) as own:
+        with _borrowed(stream) as robot, _borrowed(self.datagrams) as own:
             return own.sendto(data, socket.MSG_DONTWAIT, robot.getpeername()) == len(data)
 
 
@@ -138,26 +125,26 @@ class Duplicates:
         return len(self._links)
 
     @property
-    def state(self) -> tuple[LinkState, ...]:
-        """The descriptors and where the streams stand, for :meth:`resume`."""
-        return tuple(duplicate.state(link) for link, duplicate in self._links.items())
+    def state(self) -> tuple[Duplicate, ...]:
+        """The descriptors and the boundaries of the streams, for :meth:`resume`."""
+        return tuple(self._links.values())
 
-    def resume(self, links: Sequence[LinkState]) -> None:
-        """Go on with descriptors that are open already."""
-        self._links.update({each.link: Duplicate.of(each) for each in links})
+    def resume(self, links: Sequence[Duplicate]) -> None:
+        """Resume with descriptors that are open already."""
+        self._links.update({each.link: each for each in links})
 
     def opened(self, link: int, name: str, descriptors: Sequence[int], *, drives: bool) -> None:
         """Keep the descriptors of a link; too many links, and what is no socket or line, are closed at once."""
         if len(self._links) >= SLOTS or not descriptors or not all(map(_is_link, descriptors)):
             close_all(descriptors)
             return
-        self._links.setdefault(link, Duplicate(name, drives=drives)).take(descriptors)
+        self._links.setdefault(link, Duplicate(link, name, drives)).set_descriptors(descriptors)
 
-    def name(self, link: int) -> str | None:
+    def name_of(self, link: int) -> str | None:
         """Give the name of a link; None where there is none of this number."""
         return self._links[link].name if link in self._links else None
 
-    def named(self, name: str) -> int | None:
+    def link_of(self, name: str) -> int | None:
         """Give the number of the newest link of this name."""
         return next((link for link, each in reversed(self._links.items()) if each.name == name), None)
 
@@ -168,8 +155,8 @@ class Duplicates:
         duplicate = self._links.get(link)
         return duplicate.descriptor(at) if duplicate is not None and duplicate.boundary.outgoing else None
 
-    def stands(self, streams: dict[int, Boundary]) -> None:
-        """Note where the streams stand."""
+    def set_boundaries(self, streams: dict[int, Boundary]) -> None:
+        """Note where the streams are between frames."""
         for link, boundary in streams.items():
             if link in self._links:
                 self._links[link].boundary = boundary
@@ -184,7 +171,7 @@ class Duplicates:
         while self._links:
             self._links.popitem()[1].close()
 
-    async def leave(self) -> None:
+    async def drain(self) -> None:
         """Close all, but first let the robot read its stop: the kernel would reset what is closed with bytes unread.
 
         A robot whose own sending is held up goes on when that is read.
@@ -193,12 +180,12 @@ class Duplicates:
         ends_at = loop.time() + LEAVE_S
         while self._links and loop.time() < ends_at:
             for duplicate in self._links.values():
-                duplicate.read_away()
+                duplicate.discard_input()
             await asyncio.sleep(LEAVE_S / 25)
         self.close()
 
     async def stop(self, last: LastStop, times: int = TIMES) -> bool | None:
-        """Write the robot's stop so often; whether its link took it, None where there is no link or no stop."""
+        """Write the robot's stop so often; whether its link accepted it, None where there is no link or no stop."""
         driving = [link for link in self._links.values() if link.drives]
         if not driving or not last.frames:
             return None

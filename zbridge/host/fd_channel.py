@@ -22,10 +22,10 @@ DESCRIPTORS = 4
 _DESCRIPTOR = array.array("i")
 
 
-class Beat(msgspec.Struct, frozen=True, tag="beat"):
-    """The event loop of a gateway turns. streams: where the streams of its links stand, by the links' numbers.
+class Heartbeat(msgspec.Struct, frozen=True, tag="beat"):
+    """The event loop of a gateway runs. streams: the boundaries of the streams of its links, by the links' numbers.
 
-    Told once a second, five times while the robot is driven, and at once when ``last`` becomes another one.
+    Sent once a second, five times while the robot is driven, and at once when ``last`` becomes another one.
     """
 
     last: LastStop = LastStop()
@@ -54,9 +54,9 @@ class Shared(msgspec.Struct, frozen=True, tag="shared"):
     """The memory that both processes see (:mod:`zbridge.host.memory`); its descriptor comes along."""
 
 
-class Kept(msgspec.Struct, frozen=True, tag="kept"):
+class Deposited(msgspec.Struct, frozen=True, tag="kept"):
     """A deposit was written to the shared memory: what a successor needs if this process dies, as MessagePack
-    (:class:`Given` of the handover).
+    (:class:`HandoverState` of the handover).
 
     sockets: the numbers of the links and of their descriptors, in the order of the parcel. area, size: where it is in
     the memory. Without sockets nobody could resume.
@@ -74,11 +74,11 @@ class WantSuccessor(msgspec.Struct, frozen=True, tag="successor"):
 class Succeeded(msgspec.Struct, frozen=True, tag="succeeded"):
     """From now on the successor has the robot, whatever happens to it; this process ends by itself.
 
-    Told before the successor hears of it. A process that dies before it has told this has not handed over.
+    Sent before the successor is notified. A process that dies before it has sent this has not handed over.
     """
 
 
-FromGateway = Beat | Opened | Closed | Shared | Kept | WantSuccessor | Succeeded
+FromGateway = Heartbeat | Opened | Closed | Shared | Deposited | WantSuccessor | Succeeded
 
 
 class Started(msgspec.Struct, frozen=True, tag="started"):
@@ -88,8 +88,8 @@ class Started(msgspec.Struct, frozen=True, tag="started"):
 
 
 class Fork(msgspec.Struct, frozen=True, tag="fork"):
-    """Fork a gateway. Descriptors come along: its end of the post, the content of its file, and the socket from which
-    it takes over, if it does.
+    """Fork a gateway. Descriptors come along: its end of the channel, the content of its file, and the socket from
+    which it takes over, if it does.
     """
 
     file: str
@@ -115,7 +115,7 @@ _encode = msgspec.msgpack.Encoder().encode
 _decode = msgspec.msgpack.Decoder(Message).decode
 
 
-class Post:
+class FdChannel:
     """One end. Its socket keeps messages apart, and shows the end of the other process."""
 
     def __init__(self, end: socket.socket) -> None:
@@ -125,16 +125,16 @@ class Post:
         """Messages that found no room."""
 
     def __repr__(self) -> str:
-        return f"<Post {self.fileno()}>"
+        return f"<FdChannel {self.fileno()}>"
 
     @classmethod
-    def pair(cls) -> tuple[Post, socket.socket]:
+    def pair(cls) -> tuple[FdChannel, socket.socket]:
         """Make an end, and the far end for another process."""
         near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         return cls(near), far
 
     @classmethod
-    def inherited(cls, descriptor: int) -> Post:
+    def inherited(cls, descriptor: int) -> FdChannel:
         """Make an end of an inherited descriptor."""
         return cls(socket.socket(fileno=descriptor))
 
@@ -163,7 +163,7 @@ class Post:
         """
         try:
             data, sent = self._receive()
-        except ConnectionResetError:  # it ended with a message of ours unread: what it told before follows
+        except ConnectionResetError:  # it ended with a message of ours unread: what it sent before follows
             try:
                 data, sent = self._receive()
             except ConnectionError:

@@ -1,7 +1,7 @@
 """The robot files that a supervisor follows: directories and single files, and what has changed in them.
 
-A faulty file changes nothing: the robot that runs by what stood in it before goes on. A file that differs from the look
-before, or cannot be read, is looked at once more before it counts: an editor may be writing it.
+A faulty file changes nothing: the robot that runs by what stood in it before continues. A file that differs from the
+poll before, or cannot be read, is polled once more before it counts: an editor may be writing it.
 
 Files are read and checked on a thread of their own, never on the event loop: a slow disk, or a large file, must not
 keep the supervisor from stopping the robot of a gateway that died.
@@ -53,7 +53,7 @@ class RobotFile(msgspec.Struct, frozen=True):
 
 
 class Changes(msgspec.Struct, frozen=True):
-    """What to do about a look: files whose robots start, restart and end, and those that are faulty."""
+    """What to do after a poll: files whose robots start, restart and end, and those that are faulty."""
 
     came: tuple[RobotFile, ...] = ()
     changed: tuple[RobotFile, ...] = ()
@@ -82,7 +82,7 @@ def read(path: Path, most_bytes: int = FILE_BYTES) -> RobotFile:
 
 def check(path: Path, content: bytes) -> RobotFile:
     """Check what was read of a file; what is wrong is its fault."""
-    if not str(path).isprintable():  # so are bytes that are not UTF-8; processes tell each other the name
+    if not str(path).isprintable():  # so are bytes that are not UTF-8; processes send each other the name
         return RobotFile(path, content, fault=f"{shown(str(path))}: expected a name of printable characters in UTF-8")
     try:
         plan = load(path, content=content)
@@ -150,7 +150,7 @@ def compare(running: Mapping[Path, RobotFile], seen: Iterable[RobotFile]) -> Cha
     return Changes(tuple(came), tuple(changed), tuple(sorted(gone)), tuple(moved), tuple(faulty))
 
 
-def first_look(sources: tuple[Path, ...], most_bytes: int = FILE_BYTES) -> list[RobotFile]:
+def read_all(sources: tuple[Path, ...], most_bytes: int = FILE_BYTES) -> list[RobotFile]:
     """Read all robot files; raise ConfigError where two name one robot or one address, or no file is sound."""
     files = located(read(path, most_bytes) for path in paths_of(sources))
     if not files:
@@ -164,9 +164,9 @@ def first_look(sources: tuple[Path, ...], most_bytes: int = FILE_BYTES) -> list[
 
 
 class Follower:
-    """Looks at the files again and again; what changed counts when two looks show the same.
+    """Polls the files; a change counts when two polls show the same.
 
-    reported: the faults that are known already. most_bytes: of a file.
+    reported: the faults that were reported already. most_bytes: of a file.
     """
 
     def __init__(
@@ -185,10 +185,10 @@ class Follower:
     def __repr__(self) -> str:
         return f"<Follower of {', '.join(map(str, self._sources))}>"
 
-    def look(self, running: Mapping[Path, RobotFile], *, twice: bool = True) -> Changes:
+    def poll(self, running: Mapping[Path, RobotFile], *, twice: bool = True) -> Changes:
         """Read what may have changed; raise ConfigError if a directory cannot be read.
 
-        twice: leave out what differs from the look before. A fault is given once for each content of a file.
+        twice: leave out what differs from the poll before. A fault is reported once for each content of a file.
         """
         if not twice:
             self._faulty.clear()

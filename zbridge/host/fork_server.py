@@ -1,12 +1,12 @@
 """The fork server: a process that imported everything, and forks a gateway process on request. Opens no bus.
 
 Theory of operation. The supervisor starts the server as a program, so that its code is what is installed then. It
-imports what a gateway needs, tells :class:`Ready`, and waits for requests. A gateway is forked twice: the process in
+imports what a gateway needs, sends :class:`Ready`, and waits for requests. A gateway is forked twice: the process in
 between ends at once, and the gateway becomes a child of the supervisor, which is the reaper of its descendants. So the
 server may end, or be replaced, at any time, and no gateway notices.
 
 A fork takes only the thread that forks: the server must have one thread. It runs no event loop, and a forked process
-begins with the post, the standard streams and nothing else that is open, and with the signals of a new process.
+begins with the channel, the standard streams and nothing else that is open, and with the signals of a new process.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from typing import NoReturn
 import msgspec
 
 from zbridge.app.config import plan
-from zbridge.host.fd_channel import Fork, Forked, Post, Ready, close_all
+from zbridge.host.fd_channel import FdChannel, Fork, Forked, Ready, close_all
 from zbridge.protocol.plugin import find_protocol, protocol_names
 
 IMPORTED = ("numpy", "uvloop", "serial", "encodings.idna", "zbridge.bus.zenoh", "zbridge.app.gateway")
@@ -41,7 +41,7 @@ class Birth(msgspec.Struct, frozen=True):
     """
 
     request: Fork
-    post: int
+    channel: int
     content: int
     take_over: int = -1
 
@@ -56,7 +56,7 @@ Run = Callable[[Birth], int]
 """``run(birth)``: be a gateway until it ends; returns the exit code."""
 
 
-def serve(control: Post, run: Run) -> None:
+def serve(control: FdChannel, run: Run) -> None:
     """Import everything, then fork gateways until the other end of ``control`` is closed."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # the supervisor ends this process, by closing its end
@@ -95,33 +95,33 @@ def _import_all() -> None:
             plan({"robot": {"name": "r1"}, "device": {"protocol": name, "connect": ["tcp://127.0.0.1:1"]}})
 
 
-def _forked(control: Post, request: Fork, descriptors: list[int], run: Run) -> Forked:
+def _forked(control: FdChannel, request: Fork, descriptors: list[int], run: Run) -> Forked:
     """Fork twice; answer with the process id of the second."""
     if (count := threads()) != 1:
         return Forked(0, f"the fork server has {count} threads")
     pipe: tuple[int, ...] = ()
     try:
-        told, telling = pipe = os.pipe()
+        reader, writer = pipe = os.pipe()
         middle = os.fork()
     except OSError as error:
         close_all(pipe)
         return Forked(0, f"fork: {error.strerror}")
     if not middle:
-        _be_middle(telling, request, descriptors, run)
-    os.close(telling)
-    with os.fdopen(told, "rb") as answer:
+        _be_middle(writer, request, descriptors, run)
+    os.close(writer)
+    with os.fdopen(reader, "rb") as answer:
         pid = answer.read()
     os.waitpid(middle, 0)
     return Forked(int(pid)) if pid else Forked(0, "fork: the process in between failed")
 
 
-def _be_middle(telling: int, request: Fork, descriptors: list[int], run: Run) -> NoReturn:
-    """Fork the gateway, tell its process id, and end."""
+def _be_middle(writer: int, request: Fork, descriptors: list[int], run: Run) -> NoReturn:
+    """Fork the gateway, write its process id to the pipe, and end."""
     try:
         pid = os.fork()
         if not pid:
             _be_gateway(request, descriptors, run)
-        os.write(telling, str(pid).encode())
+        os.write(writer, str(pid).encode())
     finally:
         os._exit(0)
 
@@ -145,9 +145,9 @@ def _be_gateway(request: Fork, descriptors: list[int], run: Run) -> NoReturn:
         os._exit(code)
 
 
-def _close_others(kept: set[int]) -> None:
+def _close_others(open_descriptors: set[int]) -> None:
     for number in [int(name) for name in os.listdir("/proc/self/fd")]:
-        if number not in kept:
+        if number not in open_descriptors:
             try:
                 os.close(number)
             except OSError:  # the descriptor by which the folder was listed

@@ -2,13 +2,13 @@
 
 Layout: one slot for each link, then two areas for deposits, in anonymous memory of which only the used pages exist.
 
-A **slot** tells where the stream of a link was cut when the process died. The process sets the slot to ``READING``
+A **slot** shows where the stream of a link was cut when the process died. The process sets the slot to ``READING``
 before it takes bytes from the kernel, and to ``CUT`` when it has cut them into frames; then the slot has the incomplete
 frame (:class:`Partial`). A process that dies while a slot is ``READING`` has taken bytes that nobody knows. A slot that
 was never touched belongs to a link of which this process has read nothing.
 
-A **deposit** is what a successor needs. The process writes it to the area that is not in use, and then tells which
-area counts (:class:`zbridge.host.fd_channel.Kept`). So a process that dies while it writes leaves the one
+A **deposit** is what a successor needs. The process writes it to the area that is not in use, and then reports which
+area counts (:class:`zbridge.host.fd_channel.Deposited`). So a process that dies while it writes leaves the one
 before.
 """
 
@@ -23,7 +23,7 @@ from zbridge.wire.frames import Partial
 SLOTS = 16
 """Most links of one process at a time."""
 PARTIAL_BYTES = 64 * 1024
-"""Largest incomplete frame that is kept whole: a scan in text has 4 to 60 kB, and no length."""
+"""Largest incomplete frame that is stored whole: a scan in text has 4 to 60 kB, and no length."""
 DEPOSIT_BYTES = 1024 * 1024
 """Largest deposit."""
 _HEAD = struct.Struct("<BxxxIQ")
@@ -40,7 +40,7 @@ def slot_of(link: int) -> int:
 
 
 class MemoryWriter:
-    """The process's side. :attr:`descriptor`: to be sent to the supervisor, then closed by :meth:`sent`."""
+    """The process's side. :attr:`descriptor`: to be sent to the supervisor, then closed by :meth:`close_descriptor`."""
 
     def __init__(self) -> None:
         self.descriptor = os.memfd_create("zbridge")
@@ -51,7 +51,7 @@ class MemoryWriter:
     def __repr__(self) -> str:
         return f"<MemoryWriter area {self._area}>"
 
-    def sent(self) -> None:
+    def close_descriptor(self) -> None:
         """Close the descriptor: the supervisor has its own."""
         os.close(self.descriptor)
 
@@ -64,7 +64,7 @@ class MemoryWriter:
         self._map[slot_of(link) * _SLOT_BYTES] = _READING
 
     def cut(self, link: int, partial: Partial | None) -> None:
-        """Note where the stream stands; None: nobody could resume it here."""
+        """Note the incomplete frame of the stream; None: nobody could resume it here."""
         at = slot_of(link) * _SLOT_BYTES
         self._map[at] = _READING
         if partial is not None and (size := len(partial.rest)) <= PARTIAL_BYTES:
@@ -73,14 +73,14 @@ class MemoryWriter:
             self._map[at] = _CUT  # last: a process may die at any of these lines
 
     def deposit(self, data: bytes) -> int:
-        """Write a deposit of :data:`DEPOSIT_BYTES` at most; return its area, which counts from :meth:`told` on."""
+        """Write a deposit of :data:`DEPOSIT_BYTES` at most; return its area, which counts from :meth:`commit` on."""
         area = 1 - self._area
         start = _DEPOSITS_AT + area * DEPOSIT_BYTES
         self._map[start : start + len(data)] = data
         return area
 
-    def told(self, area: int) -> None:
-        """Note that the supervisor was told this area: the next deposit goes to the other one."""
+    def commit(self, area: int) -> None:
+        """Note that this area was reported to the supervisor: the next deposit goes to the other one."""
         self._area = area
 
     def close(self) -> None:

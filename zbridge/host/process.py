@@ -1,4 +1,4 @@
-"""One gateway process as its supervisor sees it: its beats, what it deposited, its end."""
+"""One gateway process as its supervisor sees it: its heartbeats, its deposit, its end."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from collections.abc import Callable
 
 from zbridge.host.deposit import Deposit
 from zbridge.host.fd_channel import (
-    Beat,
     Closed,
+    Deposited,
+    FdChannel,
     FromGateway,
-    Kept,
+    Heartbeat,
     Opened,
-    Post,
     Shared,
     Started,
     Succeeded,
@@ -27,7 +27,7 @@ from zbridge.host.fd_channel import (
 )
 from zbridge.host.files import RobotFile
 from zbridge.host.replacement import ProcessState
-from zbridge.host.watchdog import Heart
+from zbridge.host.watchdog import Watchdog
 from zbridge.robot.observer import LastStop
 
 log = logging.getLogger("zbridge.host")
@@ -35,7 +35,7 @@ log = logging.getLogger("zbridge.host")
 KILLED_S = 0.05
 """Longest wait for the end of a process that was killed, before its robot is stopped."""
 _MESSAGES = 64
-"""Most messages that are taken from one process before others have their turn."""
+"""Most messages that are taken from one process before others are served."""
 _DRAINED = 64
 """The same, times :data:`_MESSAGES`, of a process that has ended: more than its socket holds."""
 
@@ -50,21 +50,21 @@ class GatewayProcess:
     def __init__(
         self,
         pid: int,
-        post: Post,
+        channel: FdChannel,
         file: RobotFile,
         *,
         wants_successor: Callable[[GatewayProcess, socket.socket], object],
         changed: Callable[[], object] = lambda: None,
     ) -> None:
         self.pid = pid
-        self.post = post
+        self.channel = channel
         self.file = file
         self.deposit = Deposit()
         self.hands_over = False
         self.succeeded = False
         """Whether a successor has the robot."""
-        self.told_to_end = False
-        self.heart = Heart(time.monotonic())
+        self.asked_to_end = False
+        self.watchdog = Watchdog(time.monotonic())
         self.over: asyncio.Future[int] = asyncio.get_running_loop().create_future()
         """Done when the process has ended; its wait status."""
         self._killed: str | None = None
@@ -74,7 +74,7 @@ class GatewayProcess:
         self._wants_successor = wants_successor
         self._changed = changed
         self._loop = asyncio.get_running_loop()
-        self._loop.add_reader(post.fileno(), self.hear)
+        self._loop.add_reader(channel.fileno(), self.receive)
 
     def __repr__(self) -> str:
         return f"<GatewayProcess {self.pid} {self.last.state}>"
@@ -86,8 +86,8 @@ class GatewayProcess:
         left.cancel()
         if not self.over.done() and not self.succeeded:
             await self.gone(KILLED_S)
-        for _ in range(_DRAINED):  # all that it told before it died counts
-            if not self.hear():
+        for _ in range(_DRAINED):  # all that it sent before it died counts
+            if not self.receive():
                 break
         return self._killed or self.how
 
@@ -131,48 +131,48 @@ class GatewayProcess:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self.pid, number)
 
-    def hear(self) -> bool:
-        """Take what the process told, some messages at a time; whether there may be more."""
+    def receive(self) -> bool:
+        """Receive what the process sent, some messages at a time; whether there may be more."""
         for _ in range(_MESSAGES):
             try:
-                received = self.post.receive()
+                received = self.channel.receive()
             except BlockingIOError:
                 return False
             except ValueError as error:
-                log.error("process %d: not understood: %s", self.pid, error)
+                log.error("process %d sent an invalid message: %s", self.pid, error)
                 continue
             except OSError:  # closed
                 return False
             if received is None:
-                self._loop.remove_reader(self.post.fileno())
+                self._loop.remove_reader(self.channel.fileno())
                 return False
             message, descriptors = received
-            self._take(message, descriptors)  # type: ignore[arg-type]
+            self._handle(message, descriptors)  # type: ignore[arg-type]
         return True
 
-    def _take(self, message: FromGateway, descriptors: list[int]) -> None:
+    def _handle(self, message: FromGateway, descriptors: list[int]) -> None:
         match message:
-            case _ if self.succeeded:  # what it does at its end is its successor's no more
+            case _ if self.succeeded:  # its actions at its end no longer concern its successor
                 pass
-            case Beat():
+            case Heartbeat():
                 state, self.deposit.last, self.hands_over = self.last.state, message.last, message.hands_over
-                self.heart.beat(time.monotonic(), driven=message.last.driven)
-                self.deposit.duplicates.stands(message.streams)
-                if message.last.state != state or self.heart.beats == 1:
+                self.watchdog.heartbeat(time.monotonic(), driven=message.last.driven)
+                self.deposit.duplicates.set_boundaries(message.streams)
+                if message.last.state != state or self.watchdog.heartbeats == 1:
                     self._changed()
             case Opened():
                 self.deposit.duplicates.opened(message.link, message.name, descriptors, drives=message.drives)
                 return
             case Closed():
                 self.deposit.closed(message.link)
-            case Kept():
-                self.deposit.keep(message)
+            case Deposited():
+                self.deposit.note(message)
             case Shared() if descriptors and self.deposit.memory is None:
                 self.deposit.share(descriptors.pop(0))
             case WantSuccessor() if descriptors:
                 self._wants_successor(self, socket.socket(fileno=descriptors.pop(0)))
             case WantSuccessor():
-                self.post.send(Started("the supervisor has no free descriptor"))
+                self.channel.send(Started("the supervisor has no free descriptor"))
             case Succeeded():
                 self.succeeded = True
                 self._left.set()
@@ -180,53 +180,53 @@ class GatewayProcess:
 
     @property
     def last(self) -> LastStop:
-        """What the process told last of its robot's stop, motion and state."""
+        """What the process reported last of its robot's stop, motion and state."""
         return self.deposit.last
 
     @property
     def is_over(self) -> bool:
         """Whether the process has ended, is being ended, or has handed over."""
-        return self.over.done() or self._left.is_set() or self.told_to_end
+        return self.over.done() or self._left.is_set() or self.asked_to_end
 
     @property
     def state(self) -> ProcessState:
-        """What the code that takes the supervisor's place needs to go on, while the process is not over.
+        """What the code that takes the supervisor's place needs to resume, while the process is not over.
 
         To be read while the deposit is the process's own.
         """
         deposit = self.deposit
         return ProcessState(
             self.pid,
-            self.post.fileno(),
+            self.channel.fileno(),
             self._began,
-            self.heart.state,
+            self.watchdog,
             deposit.last,
             deposit.memory.descriptor if deposit.memory is not None else None,
             self.hands_over,
-            deposit.kept,
+            deposit.deposited,
             deposit.duplicates.state,
         )
 
     def resume(self, state: ProcessState) -> None:
-        """Go on with a process as the code before this one knew it."""
+        """Resume a process as the code before this one knew it."""
         deposit = self.deposit
-        self._began, self.heart, deposit.last = state.began, Heart.of(state.heart), state.last
-        self.hands_over, deposit.kept = state.hands_over, state.kept
+        self._began, self.watchdog, deposit.last = state.began, state.watchdog, state.last
+        self.hands_over, deposit.deposited = state.hands_over, state.deposited
         deposit.duplicates.resume(state.links)
-        if state.page is not None:
-            deposit.share(state.page)
+        if state.memory is not None:
+            deposit.share(state.memory)
 
-    def hand_on(self, successor: GatewayProcess) -> None:
+    def hand_deposit_to(self, successor: GatewayProcess) -> None:
         """Give a successor what this process deposited: it counts until the successor has made its own deposit."""
         deposit, self.deposit = self.deposit, Deposit()
-        if successor.deposit.kept is None:
-            successor.deposit.given = deposit
-        else:  # it was quicker than the news
+        if successor.deposit.deposited is None:
+            successor.deposit.predecessor = deposit
+        else:  # its deposit came before the message of the handover
             deposit.close()
 
     def close(self) -> None:
-        """Close the post and what was deposited; idempotent."""
-        if self.post.fileno() >= 0:
-            self._loop.remove_reader(self.post.fileno())
-            self.post.close()
+        """Close the channel and the deposit; idempotent."""
+        if self.channel.fileno() >= 0:
+            self._loop.remove_reader(self.channel.fileno())
+            self.channel.close()
         self.deposit.close()

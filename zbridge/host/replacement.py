@@ -4,7 +4,7 @@ Theory of operation. The process stays the same one (``exec``): its children sta
 open, and systemd sees its main process go on. First the installed code rehearses, as a process of its own: it reads
 the state and ends. So a version that does not start, or takes no such state, changes nothing. Then, at a moment when
 nothing is under way, the state goes to memory, and the installed code begins where this one was. What the children
-tell meanwhile waits in their sockets. Signals wait too: they are blocked until the installed code takes them.
+send meanwhile waits in their sockets. Signals wait too: they are blocked until the installed code takes them.
 """
 
 from __future__ import annotations
@@ -21,9 +21,10 @@ from typing import NoReturn
 import msgspec
 
 from zbridge.errors import HandoverError
-from zbridge.host.fd_channel import Kept
-from zbridge.host.watchdog import HeartState
-from zbridge.robot.observer import Boundary, LastStop
+from zbridge.host.duplicates import Duplicate
+from zbridge.host.fd_channel import Deposited
+from zbridge.host.watchdog import Watchdog
+from zbridge.robot.observer import LastStop
 from zbridge.toml import FILE_BYTES
 
 SIGNALS = (signal.SIGHUP, signal.SIGUSR2, signal.SIGTERM, signal.SIGINT)
@@ -47,35 +48,24 @@ RESUME, REHEARSE = "--resume", "--resume-check"
 """The last option but one of the command; the last is the state's descriptor."""
 
 
-class LinkState(msgspec.Struct, frozen=True):
-    """The duplicates of one link's sockets, by their descriptors."""
-
-    link: int
-    name: str
-    drives: bool
-    boundary: Boundary
-    stream: int | None = None
-    datagrams: int | None = None
-
-
 class ProcessState(msgspec.Struct, frozen=True):
-    """A running gateway process. post, page: descriptors, page that of the shared memory. began: when it was forked."""
+    """A running gateway process. channel, memory: descriptors. began: when it was forked."""
 
     pid: int
-    post: int
+    channel: int = msgspec.field(name="post")
     began: float
-    heart: HeartState
+    watchdog: Watchdog = msgspec.field(name="heart")
     last: LastStop
-    page: int | None = None
+    memory: int | None = msgspec.field(default=None, name="page")
     hands_over: bool = False
-    kept: Kept | None = None
-    links: tuple[LinkState, ...] = ()
+    deposited: Deposited | None = msgspec.field(default=None, name="kept")
+    links: tuple[Duplicate, ...] = ()
 
     @property
     def descriptors(self) -> tuple[int, ...]:
         """What must stay open."""
         of_links = (number for link in self.links for number in (link.stream, link.datagrams))
-        return tuple(number for number in (self.post, self.page, *of_links) if number is not None)
+        return tuple(number for number in (self.channel, self.memory, *of_links) if number is not None)
 
 
 class RunnerState(msgspec.Struct, frozen=True):
@@ -96,20 +86,20 @@ class RunnerState(msgspec.Struct, frozen=True):
 
 
 class ServerState(msgspec.Struct, frozen=True):
-    """The fork server. post: a descriptor. stamp: of the installation that it loaded."""
+    """The fork server. channel: a descriptor. stamp: of the installation that it loaded."""
 
     pid: int
-    post: int
+    channel: int = msgspec.field(name="post")
     stamp: bytes
 
 
 class SupervisorState(msgspec.Struct, frozen=True):
-    """Everything. at: the time of the handing over. look_at: of the next look at the hearts."""
+    """Everything. at: the time of the handing over. check_at: of the next check of the watchdogs."""
 
     version: int
     sources: tuple[str, ...]
     at: float
-    look_at: float
+    check_at: float = msgspec.field(name="look_at")
     watch: bool = False
     verbose: bool = False
     stagger_s: float = 0.0
@@ -124,7 +114,7 @@ class SupervisorState(msgspec.Struct, frozen=True):
     @property
     def descriptors(self) -> tuple[int, ...]:
         """What must stay open."""
-        of_server = (self.server.post,) if self.server is not None else ()
+        of_server = (self.server.channel,) if self.server is not None else ()
         return (*of_server, *(n for each in self.runners if each.process is not None for n in each.process.descriptors))
 
 
@@ -212,10 +202,10 @@ async def _rehearse(command: Sequence[str], state: SupervisorState) -> None:
         )
     finally:
         os.close(descriptor)
-    said = b""
+    errors = b""
     try:
         async with asyncio.timeout(REHEARSAL_S):
-            _, said = await process.communicate()
+            _, errors = await process.communicate()
     except TimeoutError:
         raise HandoverError(f"the installed code did not start within {REHEARSAL_S:g} s") from None
     finally:
@@ -223,7 +213,7 @@ async def _rehearse(command: Sequence[str], state: SupervisorState) -> None:
             process.kill()
             await process.communicate()
     if process.returncode:
-        reason = said.decode(errors="replace").strip().rpartition("\n")[2] or f"exit code {process.returncode}"
+        reason = errors.decode(errors="replace").strip().rpartition("\n")[2] or f"exit code {process.returncode}"
         raise HandoverError(f"the installed code does not start: {reason[:300]}")
 
 
@@ -243,12 +233,12 @@ def release_signals() -> None:
 
 def _execute(command: Sequence[str], state: SupervisorState) -> NoReturn:
     descriptor = store(state)
-    kept = (descriptor, *state.descriptors)
+    inherited = (descriptor, *state.descriptors)
     try:
-        for number in kept:
+        for number in inherited:
             os.set_inheritable(number, True)
         os.execv(command[0], [*command, RESUME, str(descriptor)])
     finally:  # it failed
-        for number in kept:
+        for number in inherited:
             os.set_inheritable(number, False)
         os.close(descriptor)

@@ -1,21 +1,22 @@
 """One robot of a supervisor: its process, the successor of that process, restarts, and the stop after a crash.
 
 Theory of operation. :meth:`Runner.run` holds one process after the other. A process ends by itself (it crashed), since
-it was told to (the supervisor ends, or its file changed), or as no beat came: then it is killed. Whatever the cause, if
-it did not end in order its robot is sent the stop that the process deposited last, over the duplicate of its socket.
+it was signalled to (the supervisor ends, or its file changed), or sent no heartbeat: then it is killed. Whatever the
+cause, if it did not end in order its robot is sent the stop that the process deposited last, over the duplicate of its
+socket.
 
 **A crash.** The stop is written before anything else. Then a process is forked that takes over what the dead one
 deposited, and so keeps the robot's connection; it may read and write when the stop was written often enough. Where that
 is not possible, or the third in a row has crashed, the connection is closed, and the next process starts after a time
-that :class:`BackOff` gives.
+that :class:`RestartDelay` gives.
 
-**A restart.** The process asks for a successor, and hands everything over to it. It says so
-(:class:`~zbridge.host.fd_channel.Succeeded`) before it tells the successor. That message decides:
+**A restart.** The process asks for a successor, and hands everything over to it. It reports this
+(:class:`~zbridge.host.fd_channel.Succeeded`) before it notifies the successor. That message decides:
 
 =========================  =========================================================================================
 who dies, when             what happens
 =========================  =========================================================================================
-the successor, before it   the process goes on as before
+the successor, before it   the process continues
 the process, before it     the successor is killed: it has touched nothing. Then as after a crash
 either, after it           the successor is the robot's process. Until it makes a deposit, that of the process before
                            it counts: if the successor dies, it crashed, and the robot is stopped
@@ -39,13 +40,13 @@ import msgspec
 from zbridge.app.tasks import Background
 from zbridge.errors import HandoverError, NotReady
 from zbridge.host.duplicates import PERIOD_S, TIMES
-from zbridge.host.fd_channel import Post
+from zbridge.host.fd_channel import FdChannel
 from zbridge.host.files import RobotFile
-from zbridge.host.forks import Forks
+from zbridge.host.fork_client import ForkClient
 from zbridge.host.process import KILLED_S, GatewayProcess
 from zbridge.host.replacement import RunnerState
 from zbridge.host.succession import GONE_S, Launcher, Succession
-from zbridge.host.watchdog import HEALTHY_S, BackOff
+from zbridge.host.watchdog import HEALTHY_S, RestartDelay
 from zbridge.toml import FILE_BYTES
 
 log = logging.getLogger("zbridge.host")
@@ -54,7 +55,7 @@ END_S, ASK_S = 5.0, 5.0
 """Seconds that a process is given to end in order, with its robot's stop, and to ask for its successor."""
 HAND_OVER_S = 40.0
 """Seconds that a process is given to hand over to a successor."""
-KEPT_CRASHES = 3
+RESUMED_CRASHES = 3
 """Crashes in a row over which a connection is kept: what was deposited may be what kills each of them."""
 OFFERS = 2
 """How often what a dead process left is offered to another successor, if one does not take it over."""
@@ -69,7 +70,7 @@ class Runner:
     def __init__(
         self,
         file: RobotFile,
-        forks: Forks,
+        forks: ForkClient,
         *,
         verbose: bool,
         changed: Callable[[], object],
@@ -81,7 +82,7 @@ class Runner:
         self._launcher = Launcher(forks, self._process, verbose=verbose)
         self._changed = changed
         self._most_bytes = most_bytes
-        self._back_off = BackOff()
+        self._restart_delay = RestartDelay()
         self._former: set[GatewayProcess] = set()
         """Those that have handed over or crashed, until they have ended."""
         self._tasks = Background()
@@ -116,16 +117,16 @@ class Runner:
         return self.process.last.state if self.process is not None else "down"
 
     @property
-    def is_calm(self) -> bool:
+    def is_idle(self) -> bool:
         """Whether nothing is under way but a process that runs, or the wait for the next: :attr:`state` is all then."""
         process = self.process
         under_way = self._succession.processes or self._former or self._tasks or self._restarting or self._ending
         if process is None:
             return self._waits and not under_way and not self._now.is_set()
-        return self._waits and not under_way and not process.is_over and process.deposit.given is None
+        return self._waits and not under_way and not process.is_over and process.deposit.predecessor is None
 
     @property
-    def kept(self) -> RunnerState:
+    def snapshot(self) -> RunnerState:
         """What :meth:`resume` needs, of a calm runner."""
         file = self.file
         return RunnerState(
@@ -133,7 +134,7 @@ class Runner:
             file.content,
             file.identity,
             self.restarts,
-            self._back_off.failures,
+            self._restart_delay.failures,
             self._next_at,
             self.process.state if self.process is not None else None,
             tuple(file.forms),
@@ -142,9 +143,9 @@ class Runner:
 
     def resume(self, state: RunnerState) -> None:
         """Go on where the code before this one was; then call :meth:`run`."""
-        self.restarts, self._back_off.failures, self._next_at = state.restarts, state.failures, state.next_at
+        self.restarts, self._restart_delay.failures, self._next_at = state.restarts, state.failures, state.next_at
         if state.process is not None:
-            self.process = self._process(state.process.pid, Post.inherited(state.process.post), self.file)
+            self.process = self._process(state.process.pid, FdChannel.inherited(state.process.channel), self.file)
             self.process.resume(state.process)
 
     async def run(self) -> None:
@@ -158,7 +159,7 @@ class Runner:
             except NotReady as error:
                 log.error("%s: no process: %s", self.file.robot, error)
             else:
-                await self._keep()
+                await self._supervise()
             self._changed()
             if not self._ending:
                 await self._wait(time.monotonic() - began)
@@ -180,7 +181,7 @@ class Runner:
     async def _restart(self, file: RobotFile) -> None:
         other = file.identity != self.file.identity
         self.file = file
-        self._back_off.forget()
+        self._restart_delay.reset()
         process = self.process
         if process is None:
             self._now.set()
@@ -190,25 +191,25 @@ class Runner:
 
     # One process
 
-    def _process(self, pid: int, post: Post, file: RobotFile) -> GatewayProcess:
-        process = GatewayProcess(pid, post, file, wants_successor=self._succeed, changed=self._changed)
+    def _process(self, pid: int, channel: FdChannel, file: RobotFile) -> GatewayProcess:
+        process = GatewayProcess(pid, channel, file, wants_successor=self._succeed, changed=self._changed)
         if self._ending:
             process.signal(signal.SIGTERM)
         return process
 
-    async def _keep(self) -> None:
+    async def _supervise(self) -> None:
         """Wait for the end of the process, and of those that follow it; stop the robot if it was no orderly one."""
         while (process := self.process) is not None:
             self._waits = True
             how = await process.ended()
             self._waits = False
             if process.succeeded:
-                if self._handed_on(process):
+                if self._promote_successor(process):
                     continue
                 how = "handed over to nobody"
             self.process = None
             self._former.add(process)  # it may still have to be waited for
-            if not (how is None or (process.told_to_end and not process.deposit.has_links)):
+            if not (how is None or (process.asked_to_end and not process.deposit.has_links)):
                 self.process = await self._crashed(process, how)
             await self._succession.give_up()
             self._former.discard(process)
@@ -221,14 +222,14 @@ class Runner:
         self._attended.clear()
         log.error("%s: process %d %s", self.file.robot, process.pid, how)
         await process.deposit.stop(1)  # before anything that may take time
-        stopped = asyncio.ensure_future(self._stop_again(process))
+        stopped = asyncio.ensure_future(self._repeat_stop(process))
         await self._succession.give_up()
         successor = None
-        if not self._ending and not process.told_to_end and process.deposit.has_links:
+        if not self._ending and not process.asked_to_end and process.deposit.has_links:
             successor = await self._inherited(process, stopped)
         await stopped
         if successor is None:
-            await process.deposit.leave()
+            await process.deposit.drain()
         elif successor.file.content != self.file.content:  # the file changed while the process died
             self._tasks.run(self.restart(self.file))
         self._attended.set()
@@ -239,8 +240,8 @@ class Runner:
         reason = ""
         if not await process.gone(GONE_S):
             reason = "it may still be within a read"
-        elif self._back_off.failures >= KEPT_CRASHES and process.lived_s < HEALTHY_S:
-            reason = f"{KEPT_CRASHES} processes that took it over have crashed"
+        elif self._restart_delay.failures >= RESUMED_CRASHES and process.lived_s < HEALTHY_S:
+            reason = f"{RESUMED_CRASHES} processes that took it over have crashed"
         for _ in range(0 if reason else OFFERS):
             if self._ending:
                 return None
@@ -249,44 +250,44 @@ class Runner:
             except (HandoverError, NotReady, OSError) as error:
                 reason = str(error)
             else:
-                self._back_off.failed(process.lived_s)
-                log.info("%s: process %d goes on with its connections", self.file.robot, successor.pid)
+                self._restart_delay.failed(process.lived_s)
+                log.info("%s: process %d continues with its connections", self.file.robot, successor.pid)
                 return successor
         log.error("%s: its connections are lost: %s", self.file.robot, reason)
         return None
 
-    def _handed_on(self, process: GatewayProcess) -> bool:
+    def _promote_successor(self, process: GatewayProcess) -> bool:
         """Let the successor be the robot's process; False where there is none."""
         successor = self._succession.take()
         self._settled.set()
         if successor is None:
             process.signal(signal.SIGKILL)
             return False
-        process.hand_on(successor)
+        process.hand_deposit_to(successor)
         self.process = successor
         self.file = msgspec.structs.replace(successor.file, path=self.file.path)  # it may have been renamed meanwhile
         log.info("%s: process %d serves it now", self.file.robot, successor.pid)
         self._former.add(process)
-        self._tasks.run(self._see_off(process))
+        self._tasks.run(self._await_end(process))
         return True
 
-    async def _see_off(self, process: GatewayProcess) -> None:
+    async def _await_end(self, process: GatewayProcess) -> None:
         """Wait for the end of a process that has handed over."""
         await self._gone(process)
         process.close()
         self._former.discard(process)
 
-    async def _stop_again(self, process: GatewayProcess) -> None:
+    async def _repeat_stop(self, process: GatewayProcess) -> None:
         """Write the stop that the process deposited last some times more."""
         await asyncio.sleep(PERIOD_S)
         took = await process.deposit.stop(TIMES - 1)
         if took is not None:
             moved = "it was driven" if process.last.driven else "it was not driven"
-            what = "the robot was sent its stop" if took else "the robot's link takes no stop"
+            what = "the robot was sent its stop" if took else "the robot's link is stalled: no stop was written"
             log.warning("%s: %s: %s", self.file.robot, what, moved)
 
     async def _end(self, process: GatewayProcess) -> None:
-        process.told_to_end = True
+        process.asked_to_end = True
         process.signal(signal.SIGTERM)
         await self._gone(process)
 
@@ -302,7 +303,7 @@ class Runner:
         at = time.monotonic()
         if not self._now.is_set():
             self.restarts += 1
-            delay_s = self._back_off.failed(lived_s)
+            delay_s = self._restart_delay.failed(lived_s)
             log.info("%s: next process in %.1f s", self.file.robot, delay_s)
             at += delay_s
         await self._wait_until(at)

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import msgspec
 
-from zbridge.app.config import Plan
+from zbridge.app.config import GatewayPlan
 from zbridge.errors import ConfigError
 from zbridge.host.addresses import Addresses, resolve
 from zbridge.toml import FILE_BYTES, convert, read_toml
@@ -34,7 +34,7 @@ class HostSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     file_bytes: Annotated[int, msgspec.Meta(ge=1000, le=100_000_000)] = FILE_BYTES
 
 
-class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class _HostFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     host: HostSettings = HostSettings()
 
 
@@ -45,7 +45,7 @@ def load_host(directory: Path) -> HostSettings:
         return HostSettings()
     raw = read_toml(path)
     try:
-        return convert(raw, _File).host
+        return convert(raw, _HostFile).host
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
 
@@ -58,7 +58,7 @@ def robot_files(directory: Path) -> list[Path]:
         raise ConfigError(f"{directory}: {error.strerror or error}") from error
 
 
-def require_different_robots(plans: Iterable[tuple[Path, Plan]]) -> None:
+def require_different_robots(plans: Iterable[tuple[Path, GatewayPlan]]) -> None:
     """Raise ConfigError where two files name the same robot of one realm, or of one address, or listen at one address.
 
     Resolves host names, which may take RESOLVE_S.
@@ -83,7 +83,7 @@ def require_different_robots(plans: Iterable[tuple[Path, Plan]]) -> None:
         taken.add(path, frozenset[str]().union(*(forms[address] for address in device.addresses)), device.shares)
 
 
-def require_one_bus(plans: Sequence[tuple[Path, Plan]]) -> None:
+def require_one_bus(plans: Sequence[tuple[Path, GatewayPlan]]) -> None:
     """Raise ConfigError where robots that are to share a session differ in their ``[bus]``."""
     for path, plan in plans[1:]:
         if plan.config.bus != plans[0][1].config.bus:

@@ -18,12 +18,12 @@ from pathlib import Path
 
 import msgspec
 
-from zbridge.app.handover.channel import Channel, Given, Go, Hello, Up
+from zbridge.app.handover.channel import Go, HandoverChannel, HandoverState, Hello, Up
 from zbridge.errors import HandoverError, NotReady
 from zbridge.host.duplicates import PERIOD_S
-from zbridge.host.fd_channel import Fork, Post, Started
+from zbridge.host.fd_channel import FdChannel, Fork, Started
 from zbridge.host.files import RobotFile, read
-from zbridge.host.forks import Forks
+from zbridge.host.fork_client import ForkClient
 from zbridge.host.process import GatewayProcess
 from zbridge.transport import Parcel
 
@@ -33,8 +33,8 @@ log = logging.getLogger("zbridge.host")
 STAT_S = 1.0
 """Longest wait for the disk to tell whether a robot file is still there."""
 
-Make = Callable[[int, Post, RobotFile], GatewayProcess]
-"""``make(pid, post, file)``: the process as its runner knows it."""
+Make = Callable[[int, FdChannel, RobotFile], GatewayProcess]
+"""``make(pid, channel, file)``: the process as its runner knows it."""
 
 START_S = 10.0
 """Longest time until a successor has joined the bus."""
@@ -47,7 +47,7 @@ GONE_S = 2.0
 class Launcher:
     """Starts processes; ``make`` makes of each what its runner knows."""
 
-    def __init__(self, forks: Forks, make: Make, *, verbose: bool) -> None:
+    def __init__(self, forks: ForkClient, make: Make, *, verbose: bool) -> None:
         self._forks = forks
         self._make = make
         self._verbose = verbose
@@ -58,12 +58,12 @@ class Launcher:
     async def start(self, file: RobotFile, take_over: int | None = None, *, at_once: bool = False) -> GatewayProcess:
         """Fork a process; raise NotReady with the reason: also that the file is gone, whatever stood in it.
 
-        take_over: descriptor of the socket by which it takes over. at_once: without a look at the installation.
+        take_over: descriptor of the socket by which it takes over. at_once: without a check of the installation.
         """
         if not await _is_there(file.path):
             raise NotReady(f"{file.path} is gone")
         try:
-            post, far = Post.pair()
+            channel, far = FdChannel.pair()
         except OSError as error:
             raise NotReady(error.strerror or str(error)) from error
         request = Fork(str(file.path), file.robot, self._verbose)
@@ -71,10 +71,10 @@ class Launcher:
             with far:
                 pid = await self._forks.fork(request, far, file.content, take_over, at_once=at_once)
         except NotReady:
-            post.close()
+            channel.close()
             raise
         log.info("%s: process %d", file.robot, pid)
-        return self._make(pid, post, file)
+        return self._make(pid, channel, file)
 
 
 async def _is_there(path: Path) -> bool:
@@ -128,7 +128,7 @@ class Succession:
         if reason is not None:
             log.error("%s: no successor: %s", self._robot, reason)
             self._settled.set()
-        process.post.send(Started(reason))
+        process.channel.send(Started(reason))
 
     async def _forked(
         self, process: GatewayProcess, file: RobotFile, far_end: socket.socket, alone: Callable[[], bool]
@@ -147,7 +147,7 @@ class Succession:
 
     def _forget(self, process: GatewayProcess, successor: GatewayProcess) -> None:
         """Forget a successor that ended before it had the robot."""
-        process.hear()  # it may have handed over
+        process.receive()  # it may have handed over
         if self.successor is successor and not process.succeeded:
             self.successor = None
             self._settled.set()
@@ -182,7 +182,7 @@ class Succession:
         file = msgspec.structs.replace(process.file, path=path)
         with contextlib.closing(parcel):
             near, far = socket.socketpair()
-            with contextlib.closing(Channel(near)) as channel:
+            with contextlib.closing(HandoverChannel(near)) as channel:
                 with far:
                     self.successor = successor = await self._launcher.start(file, far.fileno(), at_once=True)
                 try:
@@ -193,13 +193,13 @@ class Succession:
                     await self.give_up()
                     raise
                 self.successor = None
-                process.hand_on(successor)
+                process.hand_deposit_to(successor)
                 with contextlib.suppress(HandoverError):  # it has ended: that is a crash like any other
                     await channel.send(Go())
         return successor
 
 
-async def _give(channel: Channel, given: Given, parcel: Parcel) -> None:
+async def _give(channel: HandoverChannel, given: HandoverState, parcel: Parcel) -> None:
     """Give a successor what a dead process left, until it waits for the word to go; raise HandoverError."""
     hello = await channel.receive(Hello, START_S)
     if hello.version != given.version:

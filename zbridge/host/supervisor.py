@@ -1,10 +1,10 @@
 """``zbridge run DIR``: keeps the gateways of many robot files running, one process each.
 
 Theory of operation. The supervisor opens no bus and serves no robot. Its processes are forked by a fork server
-(:mod:`zbridge.host.fork_server`) and are its children, since it is the reaper of its descendants. One timer
-watches the beats of all processes: it fires at the earliest deadline, first takes what the processes told meanwhile,
-and kills those that are silent. Each robot has a :class:`Runner`, a task of its own. When the installation has changed,
-the supervisor gives its place to the installed code (:mod:`zbridge.host.replacement`).
+(:mod:`zbridge.host.fork_server`) and are its children, since it is the reaper of its descendants. One timer checks the
+watchdogs of all processes: it fires at the earliest deadline, first receives what the processes sent meanwhile, and
+kills those that are silent. Each robot has a :class:`Runner`, a task of its own. When the installation has changed, the
+supervisor gives its place to the installed code (:mod:`zbridge.host.replacement`).
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from pathlib import Path
 from zbridge.app.handover.processes import Systemd
 from zbridge.app.tasks import Background
 from zbridge.errors import ConfigError, HandoverError, NotReady
-from zbridge.host.files import Changes, Follower, RobotFile, compare, first_look
-from zbridge.host.forks import Forks, Stamp
+from zbridge.host.files import Changes, Follower, RobotFile, compare, read_all
+from zbridge.host.fork_client import ForkClient, Stamp
 from zbridge.host.process import GatewayProcess
 from zbridge.host.replacement import VERSION, SupervisorState, quiet_threads, release_signals, replace
 from zbridge.host.runner import Runner
@@ -35,9 +35,9 @@ from zbridge.host.settings import HostSettings
 log = logging.getLogger("zbridge.host")
 
 WATCH_S = 2.0
-"""Seconds between two looks at the files, with ``--watch``."""
+"""Seconds between two polls of the files, with ``--watch``."""
 LATE_S = 0.05
-"""A timer that fires so much later was held up by the machine."""
+"""A timer that fires so much later was delayed by the machine."""
 STATUS_S = 1.0
 """Least time between two status lines."""
 READY_S = 0.2
@@ -52,8 +52,8 @@ _PR_SET_CHILD_SUBREAPER = 36
 class Supervisor:
     """Runs the gateways of robot files.
 
-    host: how gateways run on this host. command: of the fork server. itself: the command that goes on in place of this
-    code. resumed: what the code before this one left.
+    host: how gateways run on this host. command: of the fork server. itself: the command that continues in place of
+    this code. resumed: what the code before this one left.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class Supervisor:
         self._verbose = verbose
         self._itself = itself
         self._resumed = resumed
-        self._forks = Forks(command)
+        self._forks = ForkClient(command)
         self._code: Stamp | None = None
         """The installation that this code is from."""
         self._refused: Stamp | None = None
@@ -88,9 +88,9 @@ class Supervisor:
         """Those whose file is gone, until their process has ended."""
         self._running = Background()
         self._timer: asyncio.TimerHandle | None = None
-        self._look_at = math.inf
-        """When the hearts are looked at next."""
-        self._told: asyncio.TimerHandle | None = None
+        self._check_at = math.inf
+        """When the watchdogs are checked next."""
+        self._status_timer: asyncio.TimerHandle | None = None
         self._reload = asyncio.Event()
         self._all_started = self._ends = False
         self._is_ready = False
@@ -107,7 +107,7 @@ class Supervisor:
         loop.set_default_executor(quiet_threads())
         files: list[RobotFile] = []
         if self._resumed is None:
-            files = await asyncio.to_thread(first_look, self._sources, self._host.file_bytes)
+            files = await asyncio.to_thread(read_all, self._sources, self._host.file_bytes)
         _become_reaper()
         loop.add_signal_handler(signal.SIGCHLD, self._reap)
         loop.add_signal_handler(signal.SIGHUP, self._reload.set)
@@ -120,7 +120,7 @@ class Supervisor:
             self._code = self._forks.stamp
             for task in (self._follow(), self._live()):
                 self._running.run(task)
-            self._look_at_hearts()
+            self._check_watchdogs()
             await self._apply(compare({}, files), first=True)
             self._all_started = True
             self._state_changed()
@@ -143,7 +143,7 @@ class Supervisor:
         self._systemd.notify("STOPPING=1", f"STATUS=ending {len(self._runners)} gateways")
         await asyncio.gather(*(runner.end() for runner in (*self._runners.values(), *self._leaving)))
         await self._running.cancel()
-        for timer in (self._timer, self._told):
+        for timer in (self._timer, self._status_timer):
             if timer is not None:
                 timer.cancel()
         self._forks.close()
@@ -163,7 +163,7 @@ class Supervisor:
             try:
                 if asked or self._watch:
                     running = {path: runner.file for path, runner in self._runners.items()}
-                    await self._apply(await asyncio.to_thread(self._follower.look, running, twice=not asked))
+                    await self._apply(await asyncio.to_thread(self._follower.poll, running, twice=not asked))
                 await self._forks.renew()
             except (ConfigError, NotReady) as error:
                 log.error("%s", error)
@@ -177,7 +177,7 @@ class Supervisor:
             self._runners[file.path] = runner = self._runners.pop(path)
             runner.file = file
         for file in changes.faulty:
-            runs = "its robot goes on as before" if file.path in self._runners else "no robot runs by it"
+            runs = "its robot continues as before" if file.path in self._runners else "no robot runs by it"
             log.error("%s: %s", file.fault, runs)
             self._faults[file.path] = str(file.fault)
         for path in changes.gone:
@@ -220,36 +220,36 @@ class Supervisor:
             await replace(self._itself, self._snapshot)
         except HandoverError as error:
             self._refused = stamp
-            log.error("the supervisor goes on with the code of before: %s", error)
+            log.error("the supervisor continues with the old code: %s", error)
 
     def _snapshot(self) -> SupervisorState | None:
         """Give all that the code in place of this one needs; None while something is under way."""
         runners = self._runners.values()
-        if self._ends or self._leaving or not self._all_started or not all(runner.is_calm for runner in runners):
+        if self._ends or self._leaving or not self._all_started or not all(runner.is_idle for runner in runners):
             return None
         server, leaving = self._forks.state
         return SupervisorState(
             VERSION,
             tuple(map(str, self._sources)),
             at=time.monotonic(),
-            look_at=self._look_at,
+            check_at=self._check_at,
             watch=self._watch,
             verbose=self._verbose,
             stagger_s=self._host.stagger_s,
             file_bytes=self._host.file_bytes,
             is_ready=self._is_ready,
-            runners=tuple(runner.kept for runner in runners),
+            runners=tuple(runner.snapshot for runner in runners),
             server=server,
             leaving=leaving,
             faults={str(path): fault for path, fault in self._faults.items() if str(path).isprintable()},
         )
 
     def _resume(self, state: SupervisorState) -> None:
-        """Go on where the code before this one was."""
+        """Resume where the code before this one was."""
         for number in state.descriptors:
             os.set_inheritable(number, False)
         self._forks.resume(state.server, state.leaving)
-        self._is_ready, self._look_at = state.is_ready, state.look_at
+        self._is_ready, self._check_at = state.is_ready, state.check_at
         for each in state.runners:
             forms = frozenset(each.forms)
             file = RobotFile(Path(each.path), each.content, each.identity, forms=forms, shares=each.shares)
@@ -274,39 +274,41 @@ class Supervisor:
         for process in tuple(self._processes()):
             process.reap()
 
-    def _look_at_hearts(self) -> None:
-        """Kill every process that has been silent for too long; look again at the next deadline."""
+    def _check_watchdogs(self) -> None:
+        """Kill every process that has been silent for too long; check again at the next deadline."""
         loop, now = asyncio.get_running_loop(), time.monotonic()
-        late_s = now - self._look_at
+        late_s = now - self._check_at
         deadlines = [now + 1.0]
         for process in tuple(self._processes()):
-            process.hear()
+            process.receive()
             process.reap()
             if late_s > LATE_S:
-                process.heart.excuse()
-            if not process.over.done() and now >= process.heart.deadline:
-                process.kill(f"gave no sign of life for {process.heart.silent_s(now):.1f} s")
+                process.watchdog.extend()
+            if not process.over.done() and now >= process.watchdog.deadline:
+                process.kill(f"gave no sign of life for {process.watchdog.silent_s(now):.1f} s")
             elif not process.over.done():
-                deadlines.append(process.heart.deadline)
-        self._look_at = max(now + 0.01, min(deadlines))
-        self._timer = loop.call_at(self._look_at, self._look_at_hearts)
+                deadlines.append(process.watchdog.deadline)
+        self._check_at = max(now + 0.01, min(deadlines))
+        self._timer = loop.call_at(self._check_at, self._check_watchdogs)
 
     # systemd
 
     async def _live(self) -> None:
-        """Give systemd signs of life, where it wants them."""
+        """Notify systemd's watchdog, where it wants that."""
         while self._systemd.watchdog_s:
             self._systemd.notify("WATCHDOG=1")
             await asyncio.sleep(self._systemd.watchdog_s)
 
     def _state_changed(self) -> None:
-        if self._told is None:
+        if self._status_timer is None:
             delay_s = STATUS_S if self._is_ready else READY_S
-            self._told = asyncio.get_running_loop().call_later(delay_s, self._tell)
+            self._status_timer = asyncio.get_running_loop().call_later(delay_s, self._notify_status)
 
-    def _tell(self) -> None:
-        self._told = None
-        beaten = all(runner.process is not None and runner.process.heart.beats for runner in self._runners.values())
+    def _notify_status(self) -> None:
+        self._status_timer = None
+        beaten = all(
+            runner.process is not None and runner.process.watchdog.heartbeats for runner in self._runners.values()
+        )
         ready = ("READY=1",) if beaten and self._all_started and not self._is_ready else ()
         if not self._systemd.notify(*ready, f"STATUS={self.status}"):
             self._state_changed()  # again, later

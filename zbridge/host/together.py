@@ -16,7 +16,7 @@ import random
 import time
 from collections.abc import Callable, Mapping
 
-from zbridge.app.config import Plan
+from zbridge.app.config import GatewayPlan
 from zbridge.app.gateway import Gateway, Neighbourhood
 from zbridge.app.joining import CertificateEnded, join_bus, watch_certificate
 from zbridge.app.prometheus import serve_metrics
@@ -37,7 +37,7 @@ FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 60.0
 HEALTHY_S = 60.0
 """A gateway that ran for so long begins with the first pause again."""
 
-Hold = Callable[[Plan], contextlib.AbstractAsyncContextManager[None]]
+Hold = Callable[[GatewayPlan], contextlib.AbstractAsyncContextManager[None]]
 
 
 class Together:
@@ -48,7 +48,7 @@ class Together:
     addresses while its gateway runs.
     """
 
-    def __init__(self, plans: Mapping[str, Plan], host: HostSettings, hold: Hold = hold_addresses) -> None:
+    def __init__(self, plans: Mapping[str, GatewayPlan], host: HostSettings, hold: Hold = hold_addresses) -> None:
         self.left = True
         """Whether the bus was closed in order; if not, one of its threads may hang."""
         self.metrics = Metrics()
@@ -90,11 +90,11 @@ class Together:
                 await watch_certificate(certificate, bus, Conditions())
             await asyncio.Event().wait()
 
-    def start(self, name: str, plan: Plan, after_s: float = 0.0) -> None:
+    def start(self, name: str, plan: GatewayPlan, after_s: float = 0.0) -> None:
         """Start a gateway in ``after_s`` seconds; raise ValueError where the name is taken."""
         if name in self._tasks:
             raise ValueError(f"{name!r}: runs already")
-        self._tasks[name] = asyncio.create_task(self._keep(name, plan, after_s), name=f"gateway {name}")
+        self._tasks[name] = asyncio.create_task(self._keep_running(name, plan, after_s), name=f"gateway {name}")
 
     async def stop(self, name: str) -> None:
         """Stop a robot, and end its gateway; nothing happens if there is none of this name."""
@@ -111,7 +111,7 @@ class Together:
         if tasks:
             await asyncio.wait(tasks)
 
-    async def _keep(self, name: str, plan: Plan, after_s: float) -> None:
+    async def _keep_running(self, name: str, plan: GatewayPlan, after_s: float) -> None:
         """Run a gateway, and again after it failed, until cancelled."""
         await asyncio.sleep(after_s)
         backoff, metrics = Backoff(FIRST_PAUSE_S, LONGEST_PAUSE_S), self.metrics.labelled(robot=plan.config.robot.name)
@@ -128,10 +128,10 @@ class Together:
             if time.monotonic() - begun >= HEALTHY_S:
                 backoff.reset()
             pause_s = backoff.delay_s()
-            log.warning("%s: begins anew in %.1f s", name, pause_s)
+            log.warning("%s: restarts in %.1f s", name, pause_s)
             await asyncio.sleep(pause_s)
 
-    async def _run(self, plan: Plan, metrics: Metrics) -> None:
+    async def _run(self, plan: GatewayPlan, metrics: Metrics) -> None:
         assert self._bus is not None, "run() opens the bus"
         bus = self._bus.share(metrics)
         try:
@@ -141,6 +141,6 @@ class Together:
             await bus.close()
 
 
-async def run_together(plans: Mapping[str, Plan], host: HostSettings | None = None) -> None:
+async def run_together(plans: Mapping[str, GatewayPlan], host: HostSettings | None = None) -> None:
     """Serve the robots of these plans in this process until cancelled; see :class:`Together`."""
     await Together(plans, host or HostSettings(together=True)).run()

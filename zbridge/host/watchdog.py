@@ -21,13 +21,13 @@ from collections.abc import Callable
 import msgspec
 
 DRIVEN_S = 0.8
-"""Longest time without a beat while the robot is driven."""
+"""Longest time without a heartbeat while the robot is driven."""
 IDLE_S = 5.0
 """The same while it is not driven."""
 FIRST_S = 30.0
-"""Longest time until the first beat: thirty processes that start at once share the processors."""
-EXCUSED_S = 0.2
-"""What is added for a supervisor that was held up itself."""
+"""Longest time until the first heartbeat: thirty processes that start at once share the processors."""
+EXTENSION_S = 0.2
+"""Extension of the timeout after a delay of the supervisor itself."""
 FIRST_DELAY_S = 0.25
 QUICK_RESTARTS = 5
 """Failures in a row that are answered soon."""
@@ -36,60 +36,35 @@ HEALTHY_S = 60.0
 JITTER = 0.2
 
 
-class HeartState(msgspec.Struct, frozen=True):
-    """What a heart knows, in seconds of the monotonic clock."""
+class Watchdog(msgspec.Struct):
+    """The heartbeats of one process. last: of the last one, or of the start, in seconds of the monotonic clock."""
 
     last: float
-    patience_s: float
-    excused_s: float = 0.0
-    beats: int = 0
+    timeout_s: float = msgspec.field(default=FIRST_S, name="patience_s")
+    extension_s: float = msgspec.field(default=0.0, name="excused_s")
+    heartbeats: int = msgspec.field(default=0, name="beats")
 
+    def heartbeat(self, now: float, *, driven: bool) -> None:
+        """Note a heartbeat."""
+        self.heartbeats += 1
+        self.last, self.extension_s = now, 0.0
+        self.timeout_s = DRIVEN_S if driven else IDLE_S
 
-class Heart:
-    """The beats of one process, from its start at ``now``."""
-
-    def __init__(self, now: float) -> None:
-        self._last = now
-        self._patience_s = FIRST_S
-        self._excused_s = 0.0
-        self.beats = 0
-
-    def __repr__(self) -> str:
-        return f"<Heart {self.beats} beats>"
-
-    @classmethod
-    def of(cls, state: HeartState) -> Heart:
-        """Make a heart that goes on."""
-        heart = cls(state.last)
-        heart._patience_s, heart._excused_s, heart.beats = state.patience_s, state.excused_s, state.beats
-        return heart
-
-    @property
-    def state(self) -> HeartState:
-        """What :meth:`of` needs."""
-        return HeartState(self._last, self._patience_s, self._excused_s, self.beats)
-
-    def beat(self, now: float, *, driven: bool) -> None:
-        """Note a beat."""
-        self.beats += 1
-        self._last, self._excused_s = now, 0.0
-        self._patience_s = DRIVEN_S if driven else IDLE_S
-
-    def excuse(self) -> None:
-        """Wait longer for the next beat: the supervisor itself did not run for a while, so neither did the process."""
-        self._excused_s = EXCUSED_S
+    def extend(self) -> None:
+        """Wait longer for the next heartbeat: the supervisor itself did not run for a while, nor may the process."""
+        self.extension_s = EXTENSION_S
 
     @property
     def deadline(self) -> float:
         """The time at which the process counts as hung."""
-        return self._last + self._patience_s + self._excused_s
+        return self.last + self.timeout_s + self.extension_s
 
     def silent_s(self, now: float) -> float:
-        """Give the seconds since the last beat."""
-        return now - self._last
+        """Give the seconds since the last heartbeat."""
+        return now - self.last
 
 
-class BackOff:
+class RestartDelay:
     """The failures of one process in a row. chance: gives a number from 0 to 1."""
 
     def __init__(self, chance: Callable[[], float] = random.random) -> None:
@@ -97,7 +72,7 @@ class BackOff:
         self._chance = chance
 
     def __repr__(self) -> str:
-        return f"<BackOff after {self.failures} failures>"
+        return f"<RestartDelay after {self.failures} failures>"
 
     def failed(self, lived_s: float) -> float:
         """Note a failure after so many seconds of life; return the seconds until the next start."""
@@ -105,6 +80,6 @@ class BackOff:
         base_s = FIRST_DELAY_S * 2 ** (self.failures - 1) if self.failures <= QUICK_RESTARTS else LONG_DELAY_S
         return base_s * (1 + JITTER * (2 * self._chance() - 1))
 
-    def forget(self) -> None:
-        """Begin anew: what failed was changed."""
+    def reset(self) -> None:
+        """Count failures from zero: the file or code that failed has changed."""
         self.failures = 0

@@ -5,9 +5,9 @@ What it lacks is denied; nothing is denied by name, for a denial of ``@cmd/drive
 
 Ingress rules confine: each member may send what the table grants, and nothing else. One egress rule is shared by all
 known members and is as wide as the widest key expression that anybody uses. A rule passes only what its key expression
-includes: narrow egress rules would lose stops with wildcards, gets, and the news of subscriptions with wildcards,
-without which publishers send nothing. A member receives only what it subscribed to or asked for, and ingress rules
-confine both. Knows no Zenoh: the rules are what JSON can hold.
+includes: narrow egress rules would lose stops with wildcards, gets, and the declarations of subscriptions with
+wildcards, without which publishers send nothing. A member receives only what it subscribed to or asked for, and ingress
+rules confine both. Knows no Zenoh: the rules are what JSON can hold.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ _EVERYBODY = "everybody"
 _BOUNDED = ("put", "delete", "query", "reply")
 
 
-class Kind(StrEnum):
-    """The messages of Zenoh that its access rules tell apart."""
+class MessageKind(StrEnum):
+    """The messages of Zenoh that its access rules distinguish."""
 
     PUT = "put"
     DELETE = "delete"
@@ -85,68 +85,68 @@ class Grant(msgspec.Struct, frozen=True):
     """What may be sent on a class of keys. own: of the member's robots only, not of all."""
 
     keys: Keys
-    kinds: tuple[Kind, ...]
+    kinds: tuple[MessageKind, ...]
     own: bool = False
 
 
 Column = Literal["viewer", "operator", "supervisor", "gateway", "gateway with listeners", "hq", "recorder", "router"]
-"""What members the table tells apart: the roles, and a gateway whose process serves HQ programs too."""
+"""The members that the table distinguishes: the roles, and a gateway whose process serves HQ programs too."""
 
-_LISTEN = (Kind.SUBSCRIBE, Kind.QUERY)
-_SEE = (Kind.ASK_ALIVE, Kind.WATCH_ALIVE)
-_ANSWER = (Kind.QUERYABLE, Kind.REPLY)
+_LISTEN = (MessageKind.SUBSCRIBE, MessageKind.QUERY)
+_SEE = (MessageKind.ASK_ALIVE, MessageKind.WATCH_ALIVE)
+_ANSWER = (MessageKind.QUERYABLE, MessageKind.REPLY)
 
 _VIEWER = (
     Grant(Keys.DATA, _LISTEN),
     Grant(Keys.ALIVE, _SEE),
-    Grant(Keys.SESSIONS, (Kind.QUERY,)),
-    Grant(Keys.STOP, (Kind.PUT,)),
-    Grant(Keys.WHOAMI, (Kind.QUERY,)),
+    Grant(Keys.SESSIONS, (MessageKind.QUERY,)),
+    Grant(Keys.STOP, (MessageKind.PUT,)),
+    Grant(Keys.WHOAMI, (MessageKind.QUERY,)),
 )
 _DRIVER = (
     *_VIEWER,
-    Grant(Keys.COMMANDS, (Kind.PUT,)),
-    Grant(Keys.MARK, (Kind.PUT,)),
-    Grant(Keys.ACQUIRE, (Kind.QUERY,)),
-    Grant(Keys.LEASE, (Kind.QUERY,)),
-    Grant(Keys.ASK, (Kind.QUERY,)),
-    Grant(Keys.OPERATOR_TOKEN, (Kind.TOKEN,)),
+    Grant(Keys.COMMANDS, (MessageKind.PUT,)),
+    Grant(Keys.MARK, (MessageKind.PUT,)),
+    Grant(Keys.ACQUIRE, (MessageKind.QUERY,)),
+    Grant(Keys.LEASE, (MessageKind.QUERY,)),
+    Grant(Keys.ASK, (MessageKind.QUERY,)),
+    Grant(Keys.OPERATOR_TOKEN, (MessageKind.TOKEN,)),
 )
-_OPERATOR = (*_DRIVER, Grant(Keys.UNLATCH, (Kind.QUERY,)))
+_OPERATOR = (*_DRIVER, Grant(Keys.UNLATCH, (MessageKind.QUERY,)))
 _SUPERVISOR = (
     *_OPERATOR,
-    Grant(Keys.TAKEOVER, (Kind.QUERY,)),
-    Grant(Keys.UNLATCH_FLEET, (Kind.QUERY,)),
-    Grant(Keys.RESTART, (Kind.QUERY,)),
-    Grant(Keys.WIRE, (Kind.SUBSCRIBE,)),
-    Grant(Keys.ADMIN, (Kind.QUERY,)),
+    Grant(Keys.TAKEOVER, (MessageKind.QUERY,)),
+    Grant(Keys.UNLATCH_FLEET, (MessageKind.QUERY,)),
+    Grant(Keys.RESTART, (MessageKind.QUERY,)),
+    Grant(Keys.WIRE, (MessageKind.SUBSCRIBE,)),
+    Grant(Keys.ADMIN, (MessageKind.QUERY,)),
 )
 _HQ = (
     *(msgspec.structs.replace(grant, own=True) for grant in _DRIVER),
-    Grant(Keys.HQ_ACQUIRE, (Kind.QUERY,), own=True),
-    Grant(Keys.HQ_REFUSED, (Kind.QUERY,), own=True),
+    Grant(Keys.HQ_ACQUIRE, (MessageKind.QUERY,), own=True),
+    Grant(Keys.HQ_REFUSED, (MessageKind.QUERY,), own=True),
     Grant(Keys.HQ_SESSIONS, _ANSWER, own=True),
-    Grant(Keys.HQ_TOKEN, (Kind.TOKEN,), own=True),
+    Grant(Keys.HQ_TOKEN, (MessageKind.TOKEN,), own=True),
 )
 _GATEWAY = (
-    Grant(Keys.DATA, (Kind.PUT, *_ANSWER), own=True),
-    Grant(Keys.COMMANDS, (Kind.SUBSCRIBE,), own=True),
+    Grant(Keys.DATA, (MessageKind.PUT, *_ANSWER), own=True),
+    Grant(Keys.COMMANDS, (MessageKind.SUBSCRIBE,), own=True),
     Grant(Keys.RPC, _ANSWER, own=True),
-    Grant(Keys.CLAIM, (Kind.QUERY,), own=True),
-    Grant(Keys.LATCH, (Kind.QUERY,)),
-    Grant(Keys.WIRE, (Kind.PUT,), own=True),
+    Grant(Keys.CLAIM, (MessageKind.QUERY,), own=True),
+    Grant(Keys.LATCH, (MessageKind.QUERY,)),
+    Grant(Keys.WIRE, (MessageKind.PUT,), own=True),
     Grant(Keys.ALIVE, _SEE, own=True),
-    Grant(Keys.GATEWAY_TOKEN, (Kind.TOKEN,), own=True),
-    Grant(Keys.WHOAMI, (Kind.QUERY,)),
+    Grant(Keys.GATEWAY_TOKEN, (MessageKind.TOKEN,), own=True),
+    Grant(Keys.WHOAMI, (MessageKind.QUERY,)),
 )
 _RECORDER = (
     Grant(Keys.DATA, _LISTEN),
-    Grant(Keys.COMMANDS, (Kind.SUBSCRIBE,)),
-    Grant(Keys.MARK, (Kind.SUBSCRIBE,)),
-    Grant(Keys.WIRE, (Kind.SUBSCRIBE,)),
+    Grant(Keys.COMMANDS, (MessageKind.SUBSCRIBE,)),
+    Grant(Keys.MARK, (MessageKind.SUBSCRIBE,)),
+    Grant(Keys.WIRE, (MessageKind.SUBSCRIBE,)),
     Grant(Keys.ALIVE, _SEE),
-    Grant(Keys.SESSIONS, (Kind.QUERY,)),
-    Grant(Keys.WHOAMI, (Kind.QUERY,)),
+    Grant(Keys.SESSIONS, (MessageKind.QUERY,)),
+    Grant(Keys.WHOAMI, (MessageKind.QUERY,)),
 )
 
 GRANTS: Mapping[Column, tuple[Grant, ...]] = {
@@ -157,7 +157,7 @@ GRANTS: Mapping[Column, tuple[Grant, ...]] = {
     "gateway with listeners": (*_GATEWAY, *_HQ),
     "hq": _HQ,
     "recorder": _RECORDER,
-    "router": (Grant(Keys.EVERYTHING, tuple(Kind)),),
+    "router": (Grant(Keys.EVERYTHING, tuple(MessageKind)),),
 }
 
 NEEDED: Mapping[str, Role] = {
@@ -188,9 +188,9 @@ def expressions(keys: Keys, realm: str, name: str, robots: Iterable[str]) -> Ite
             yield written if path.startswith("@/") else f"{realm}/{written}"
 
 
-def granted(name: str, member: Member, realm: str) -> dict[tuple[Kind, ...], tuple[str, ...]]:
+def granted(name: str, member: Member, realm: str) -> dict[tuple[MessageKind, ...], tuple[str, ...]]:
     """Return the key expressions that a member may use, by the kinds of messages that it may send on them."""
-    by_kinds: dict[tuple[Kind, ...], dict[str, None]] = {}
+    by_kinds: dict[tuple[MessageKind, ...], dict[str, None]] = {}
     for grant in GRANTS[column(member)]:
         robots = member.robots if grant.own else ("*",)
         for expression in expressions(grant.keys, realm, name, robots):
@@ -200,11 +200,11 @@ def granted(name: str, member: Member, realm: str) -> dict[tuple[Kind, ...], tup
 
 def access_control(roles: Roles, realm: str) -> dict[str, Any]:
     """Return Zenoh's ``access_control``: default deny, subjects by the common names of their certificates."""
-    users: dict[tuple[tuple[Kind, ...], tuple[str, ...]], list[str]] = {}
+    users: dict[tuple[tuple[MessageKind, ...], tuple[str, ...]], list[str]] = {}
     for name, member in roles.names.items():
         for rule in granted(name, member, realm).items():
             users.setdefault(rule, []).append(roles.common_name(name))
-    rules = [_rule(_EVERYBODY, "egress", tuple(Kind), _widest(realm))]
+    rules = [_rule(_EVERYBODY, "egress", tuple(MessageKind), _widest(realm))]
     obeyed = {roles.common_name(name): [_EVERYBODY] for name in roles.names}
     for (kinds, key_exprs), common_names in users.items():
         rule_id = f"{_some(common_names)}: {', '.join(kinds)}"
@@ -260,7 +260,7 @@ def _some(names: list[str]) -> str:
     return names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
 
 
-def _rule(name: str, flow: str, kinds: Iterable[Kind], key_exprs: Iterable[str]) -> dict[str, Any]:
+def _rule(name: str, flow: str, kinds: Iterable[MessageKind], key_exprs: Iterable[str]) -> dict[str, Any]:
     return {
         "id": name,
         "flows": [flow],

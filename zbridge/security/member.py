@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from zbridge.app.config import Plan
+from zbridge.app.config import GatewayPlan
 from zbridge.bus import Tls
 from zbridge.bus.tls.certificate import Certificate
 from zbridge.bus.tls.files import is_of_authority, own_certificate, unusable
@@ -15,7 +15,7 @@ from zbridge.errors import ConfigError
 from zbridge.security.roles import ROLES
 
 
-def check_member(plan: Plan) -> Certificate | None:
+def check_member(plan: GatewayPlan) -> Certificate | None:
     """Return the certificate of a gateway's bus, None without one; raise ConfigError for what no time will mend.
 
     That is: files that are not there, do not match, or can be read by others, and a role that does not fit.
@@ -38,15 +38,15 @@ def check_member(plan: Plan) -> Certificate | None:
     return certificate
 
 
-def not_checked(plan: Plan, certificate: Certificate) -> str:
-    """Say what only the router can tell."""
+def not_checked(plan: GatewayPlan, certificate: Certificate) -> str:
+    """Return a note on what only the router can check."""
     what = "serve" if plan.device is not None else "serve HQ programs of"
     return (
         f"not checked: whether the router knows {certificate.common_name} and lets it {what} {plan.config.robot.name}"
     )
 
 
-def _check_role(plan: Plan, tls: Tls, certificate: Certificate) -> None:
+def _check_role(plan: GatewayPlan, tls: Tls, certificate: Certificate) -> None:
     needed = "gateway" if plan.device is not None else "hq"
     if certificate.role == needed or certificate.role not in ROLES:  # not ours: its rules are its owner's
         return

@@ -65,7 +65,7 @@ class Roles(msgspec.Struct, frozen=True):
         return Roles(names, (*self.revoked, name))
 
 
-class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class _RolesFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     names: dict[str, dict[str, Any]] = {}
     revoked: tuple[str, ...] = ()
 
@@ -79,7 +79,7 @@ def load_roles(path: Path) -> Roles:
     """Read ``roles.toml``; raise ConfigError, which names file, key, value and what was expected."""
     raw = read_toml(path, ROLES_BYTES)
     try:
-        file = convert(raw, _File)
+        file = convert(raw, _RolesFile)
         names = {name: convert(table, Member, f"names.{name}.") for name, table in file.names.items()}
         return _checked(Roles(names, file.revoked))
     except ConfigError as error:

@@ -26,7 +26,7 @@ log = logging.getLogger("zbridge.security.router")
 FOLD_S = 10.0
 """Seconds within which the same warning is logged once, with how often it came before."""
 KINDS = 64
-"""Different warnings that are told apart; all others share one."""
+"""Different warnings that are counted apart; all others share one."""
 
 
 class Router:
@@ -48,7 +48,7 @@ class Router:
             raise ConfigError(f"no router at {', '.join(settings.listen)}: {error}") from error
         try:
             self._serve(bus)
-            log.info("router at %s: %s", ", ".join(settings.listen), self._said())
+            log.info("router at %s: %s", ", ".join(settings.listen), self._summary())
             await asyncio.Event().wait()
         finally:
             await bus.close()
@@ -79,7 +79,7 @@ class Router:
         if self._plan.settings.tls is not None:
             bus.answer(topics.whoami(self._plan.settings.realm, "*"), self.answer)
 
-    def _said(self) -> str:
+    def _summary(self) -> str:
         if self._plan.settings.tls is None:
             return "without tls, whoever reaches it may do everything"
         names = self._plan.roles.names
@@ -88,31 +88,31 @@ class Router:
 
 
 class ZenohWarnings:
-    """Says in words what Zenoh's log says; :meth:`take` is called with each of its lines.
+    """Logs Zenoh's log in the terms of this project; :meth:`take` is called with each of its lines.
 
     A peer that tries again and again would fill the log: the same warning is logged once in :data:`FOLD_S`.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._told: dict[str, tuple[float, int]] = {}
+        self._logged: dict[str, tuple[float, int]] = {}
         """By warning, when it was logged, and how often it came since."""
 
     def __repr__(self) -> str:
-        return f"<ZenohWarnings {len(self._told)}>"
+        return f"<ZenohWarnings {len(self._logged)}>"
 
     def take(self, line: str) -> None:
         """Log one line of Zenoh's log."""
         level, text = in_our_words(line)
-        if text not in self._told and len(self._told) >= KINDS:
-            text = "Zenoh says more than can be told apart"
-        at, more = self._told.get(text, (-FOLD_S, 0))
+        if text not in self._logged and len(self._logged) >= KINDS:
+            text = "more kinds of Zenoh warnings than are counted apart"
+        at, more = self._logged.get(text, (-FOLD_S, 0))
         now = self._clock()
         if now - at < FOLD_S:
-            self._told[text] = (at, more + 1)
+            self._logged[text] = (at, more + 1)
             return
-        self._told[text] = (now, 0)
-        log.log(level, "%s%s", text, f" ({more} times more since it was last said)" if more else "")
+        self._logged[text] = (now, 0)
+        log.log(level, "%s%s", text, f" ({more} times more since it was last logged)" if more else "")
 
 
 def in_our_words(line: str) -> tuple[int, str]:
@@ -121,14 +121,14 @@ def in_our_words(line: str) -> tuple[int, str]:
         if re.search(pattern, line):
             return logging.WARNING, text
     match = _LINE.match(line)
-    if match is None or _SAID_ELSEWHERE in line:
+    if match is None or _LOGGED_ELSEWHERE in line:
         return logging.DEBUG, line
     return _LEVELS[match["level"]], f"Zenoh: {_TAIL.sub('', match['text'])}"
 
 
 _LINE = re.compile(r"\S+Z\s+(?P<level>ERROR|WARN|INFO|DEBUG|TRACE) .*?(?P<text>zenoh\S*: .*)")
 _TAIL = re.compile(r"\.? Hint: increase the system open file limit\.|\s+at /\S+\.rs:\d+\.?")
-_SAID_ELSEWHERE = "Unable to open listener"
+_LOGGED_ELSEWHERE = "Unable to open listener"
 """Also an error, which ends the process with its text."""
 _LEVELS = {
     "ERROR": logging.ERROR,
@@ -154,4 +154,4 @@ _WORDS = (
     ("Unknown \\w+ id", "a member took back a token, subscription or queryable that its rules had not let through"),
     ("Too many open files", "no more connections: this process may open no more files (ulimit -n)"),
 )
-"""What Zenoh's lines hold, and what is said instead. The first that fits is taken."""
+"""Patterns of Zenoh's lines, and what is logged instead. The first match counts."""

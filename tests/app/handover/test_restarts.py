@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from zbridge.app.config import Plan, plan
+from zbridge.app.config import GatewayPlan, plan
 from zbridge.app.handover import restarts as module
-from zbridge.app.handover.channel import VERSION, Given
+from zbridge.app.handover.channel import VERSION, HandoverState
 from zbridge.app.handover.incoming import Incoming
 from zbridge.app.handover.restarts import ClaimPart, Restarts
 from zbridge.bus.fake import FakeBus
@@ -25,7 +25,7 @@ DEVICE = {"protocol": "alf", "connect": ["tcp://127.0.0.1:1"]}
 ASKED = "fleet/r1/@rpc/restart/ann"
 
 
-def planned(**bus: Any) -> Plan:
+def planned(**bus: Any) -> GatewayPlan:
     return plan({"robot": {"name": "r1"}, "device": DEVICE, "bus": bus})
 
 
@@ -73,7 +73,7 @@ class PlayedOutgoing:
         self,
         successor: object,
         parts: Callable[[], list[Any]],
-        describe: Callable[[Parcel], Given],
+        describe: Callable[[Parcel], HandoverState],
         drain: Callable[[], Any],
         *machine: object,
     ) -> None:
@@ -92,7 +92,7 @@ def handovers(monkeypatch: pytest.MonkeyPatch) -> list[PlayedOutgoing]:
     return PlayedOutgoing.made
 
 
-def made(config: Plan | None = None, incoming: Incoming | None = None, successor: Any = "some") -> Restarts:
+def made(config: GatewayPlan | None = None, incoming: Incoming | None = None, successor: Any = "some") -> Restarts:
     return Restarts(config or planned(), KeySpace("fleet", "r1"), incoming, successor)
 
 
@@ -217,7 +217,7 @@ def test_a_robot_is_kept_for_a_successor_only_where_it_is_owned_and_can_go_on(
     restarts = made()
     if device is not None or claim is not None:
         restarts.device, restarts.claim = Part(device), Part(claim)  # type: ignore[assignment]
-    given = restarts.keep(Parcel(), Budget(1000))
+    given = restarts.deposit(Parcel(), Budget(1000))
     assert (given is not None) is kept
     if given is not None:
         assert (given.version, given.device, given.claim, given.listeners) == (VERSION, device, claim, ())

@@ -22,7 +22,7 @@ from zbridge.bus.tls.files import (
 )
 from zbridge.errors import ConfigError
 from zbridge.security.certs import authority, x509
-from zbridge.security.certs.authority import Request, load_certificate
+from zbridge.security.certs.authority import CertificateRequest, load_certificate
 from zbridge.security.certs.files import Folder
 from zbridge.security.roles import Member
 
@@ -34,8 +34,8 @@ DAY = timedelta(days=1)
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Folder:
     folder = Folder(tmp_path_factory.mktemp("lab") / "certs")
     authority.init(folder, NOW)
-    authority.issue(folder, Request("hub", Member("router"), ("hub.lab",)), NOW)
-    authority.issue(folder, Request("g1", Member("gateway", ("r1",)), days=90), NOW)
+    authority.issue(folder, CertificateRequest("hub", Member("router"), ("hub.lab",)), NOW)
+    authority.issue(folder, CertificateRequest("g1", Member("gateway", ("r1",)), days=90), NOW)
     return folder
 
 

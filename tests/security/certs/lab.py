@@ -8,7 +8,7 @@ import msgspec
 from cryptography.x509 import Certificate, load_pem_x509_certificate
 
 from zbridge.security.certs import authority
-from zbridge.security.certs.authority import Issued, Request
+from zbridge.security.certs.authority import CertificateRequest, Issued
 from zbridge.security.certs.files import Folder
 from zbridge.security.roles import Member, Role
 
@@ -26,7 +26,7 @@ class Lab(msgspec.Struct, frozen=True):
         days: int = 365,
         force: bool = False,
     ) -> Issued:
-        request = Request(name, Member(role, robots), hosts, days)
+        request = CertificateRequest(name, Member(role, robots), hosts, days)
         return authority.issue(self.folder, request, self.now, force=force)
 
     def later(self, days: float) -> Lab:

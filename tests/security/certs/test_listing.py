@@ -11,11 +11,11 @@ from cryptography.hazmat.primitives import hashes
 from tests.security.certs.lab import Lab
 from zbridge.errors import ConfigError
 from zbridge.security.certs import authority
-from zbridge.security.certs.authority import Entry, list_names
+from zbridge.security.certs.authority import ListedCertificate, list_names
 from zbridge.security.roles import Member, Roles, save_roles
 
 
-def entry(lab: Lab, name: str) -> Entry:
+def entry(lab: Lab, name: str) -> ListedCertificate:
     return next(entry for entry in list_names(lab.folder, lab.now) if entry.name == name)
 
 
@@ -23,7 +23,7 @@ def test_the_list_tells_role_robots_hosts_expiry_and_fingerprint(lab: Lab) -> No
     issued = lab.issue("r1", "gateway", "r1", "r2")
     lab.issue("hub", "router", hosts=("hub.lab", "192.168.0.2"))
     fingerprint = lab.certificate("r1").fingerprint(hashes.SHA256())
-    assert entry(lab, "r1") == Entry(
+    assert entry(lab, "r1") == ListedCertificate(
         "r1", "gateway", ("r1", "r2"), (), issued.expires, ":".join(f"{byte:02X}" for byte in fingerprint)
     )
     assert entry(lab, "hub").hosts == ("hub.lab", "192.168.0.2")

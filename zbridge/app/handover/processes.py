@@ -18,7 +18,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol
 
-from zbridge.app.handover.channel import Channel
+from zbridge.app.handover.channel import HandoverChannel
 from zbridge.errors import HandoverError
 
 END_S = 2.0
@@ -64,14 +64,14 @@ class Processes:
         """The number of this process."""
         return os.getpid()
 
-    def pair(self) -> tuple[Channel, socket.socket]:
+    def pair(self) -> tuple[HandoverChannel, socket.socket]:
         """Make a channel, and the far end of its socket for a successor; raise OSError."""
         near, far = socket.socketpair()
-        return Channel(near), far
+        return HandoverChannel(near), far
 
-    def channel(self, end: socket.socket) -> Channel:
+    def channel(self, end: socket.socket) -> HandoverChannel:
         """Make a channel of the end that another process made."""
-        return Channel(end)
+        return HandoverChannel(end)
 
     def process(self, pid: int) -> OtherProcess:
         """Return the process of this number."""
@@ -92,10 +92,10 @@ class Successor(Protocol):
         """
 
     def handed_over(self) -> bool:
-        """Note that the successor has the robot from now on; called before the successor is told.
+        """Note that the successor has the robot from now on; called before *go* is sent to it.
 
-        True: somebody looks after the robot whatever happens to either process, so there is no way back. False: nobody
-        does; this process takes everything back if the successor cannot be told.
+        True: a supervisor stops the robot whatever happens to either process, so there is no way back. False: nobody
+        does; this process takes everything back if *go* cannot be sent.
         """
 
 
@@ -119,7 +119,7 @@ class Spawn:
             raise HandoverError(f"no process can be started: {error}") from error
 
     def handed_over(self) -> bool:
-        """Return False: nobody looks after two processes."""
+        """Return False: no supervisor monitors the two processes."""
         return False
 
     def _start(self, descriptor: int) -> subprocess.Popen[bytes]:

@@ -11,10 +11,10 @@ from collections.abc import Callable, Sequence
 
 import msgspec
 
-from zbridge.app.config import Plan
-from zbridge.app.handover.channel import VERSION, Given
+from zbridge.app.config import GatewayPlan
+from zbridge.app.handover.channel import VERSION, HandoverState
 from zbridge.app.handover.incoming import Incoming
-from zbridge.app.handover.outgoing import Outgoing, Part
+from zbridge.app.handover.outgoing import HandoverPart, Outgoing
 from zbridge.app.handover.processes import PROCESSES, Processes, Successor
 from zbridge.bus import Bus, Handle, IncomingQuery
 from zbridge.control.gate import NameGate
@@ -85,7 +85,7 @@ class Restarts:
 
     def __init__(
         self,
-        plan: Plan,
+        plan: GatewayPlan,
         keys: KeySpace,
         incoming: Incoming | None,
         successor: Successor | None,
@@ -97,7 +97,7 @@ class Restarts:
         self._processes = processes
         self._kernel = kernel
         self.bus: Bus | None = None
-        self.listeners: Sequence[Part] = ()
+        self.listeners: Sequence[HandoverPart] = ()
         self.device: Device | None = None
         self.claim: ClaimPart | None = None
         self.latches: LatchStore | None = None
@@ -136,13 +136,13 @@ class Restarts:
         async with self._lock:
             return
 
-    def keep(self, parcel: Parcel, budget: Budget) -> Given | None:
+    def deposit(self, parcel: Parcel, budget: Budget) -> HandoverState | None:
         """Describe the robot's part as it is now, for a successor of a gateway that died; None where none can go on."""
         device = self.device.keep(parcel, budget) if self.device is not None else None
         claim = self.claim.hand_over(parcel) if self.claim is not None else None
         if device is None or not claim:
             return None
-        return Given(VERSION, self._plan.setup, len(parcel), claim=claim, device=device)
+        return HandoverState(VERSION, self._plan.setup, len(parcel), claim=claim, device=device)
 
     def answer(self, bus: Bus) -> Handle:
         """Restart for whoever the access rules let ask, and answer when that is done."""
@@ -185,7 +185,7 @@ class Restarts:
             pid = await self._outgoing.run()
             log.info("handed over to process %d in %.0f ms", pid, (self._clock() - began) * 1000)
 
-    def _parts(self) -> list[Part]:
+    def _parts(self) -> list[HandoverPart]:
         """Give what there is to hand over now."""
         self._handed_over = self.device
         return [part for part in (*self.listeners, self.device, self.claim) if part is not None]
@@ -202,9 +202,9 @@ class Restarts:
         if self.bus is not None and self.claim is not None:
             await self.bus.drain(self._keys.key(CLAIM))  # the successor answers
 
-    def _describe(self, parcel: Parcel) -> Given:
+    def _describe(self, parcel: Parcel) -> HandoverState:
         self._require_same_device()
-        given = Given(
+        state = HandoverState(
             VERSION,
             self._plan.setup,
             0,
@@ -213,4 +213,4 @@ class Restarts:
             listeners=tuple(part.hand_over(parcel) for part in self.listeners),
             metrics=tuple(parcel.put(sock.fileno()) for sock in self.metrics_sockets),
         )
-        return msgspec.structs.replace(given, descriptors=len(parcel))
+        return msgspec.structs.replace(state, descriptors=len(parcel))

@@ -45,7 +45,7 @@ def load_certificate(path: Path) -> Certificate:
         raise ConfigError(f"{path}: {error}") from error
 
 
-def load_authority(folder: Folder, now: datetime) -> x509.Authority:
+def load_authority(folder: Folder, now: datetime) -> x509.CertificateAuthority:
     """Read the authority; raise ConfigError also if it has expired or its key is not its own."""
     certificate = load_certificate(folder.ca)
     if certificate.not_valid_after_utc <= now:
@@ -53,7 +53,7 @@ def load_authority(folder: Folder, now: datetime) -> x509.Authority:
             f"{folder.ca}: the authority expired on {certificate.not_valid_after_utc:%Y-%m-%d}; `zbridge certs init"
             " --force` makes another, and every name then needs `zbridge certs renew`"
         )
-    return x509.Authority(certificate, _matching_key(folder.ca_key, certificate))
+    return x509.CertificateAuthority(certificate, _matching_key(folder.ca_key, certificate))
 
 
 def load_name(folder: Folder, name: str) -> tuple[EllipticCurvePrivateKey, Certificate]:
@@ -87,7 +87,7 @@ def _matching_key(path: Path, certificate: Certificate) -> EllipticCurvePrivateK
     return key
 
 
-class Request(msgspec.Struct, frozen=True):
+class CertificateRequest(msgspec.Struct, frozen=True):
     """What is to be issued. hosts: where a server with this certificate is reached; a router has at least one."""
 
     name: str
@@ -128,7 +128,7 @@ def init(folder: Folder, now: datetime, *, force: bool = False) -> Issued:
     return _issued(made.certificate)
 
 
-def issue(folder: Folder, request: Request, now: datetime, *, force: bool = False) -> Issued:
+def issue(folder: Folder, request: CertificateRequest, now: datetime, *, force: bool = False) -> Issued:
     """Make key and certificate of a name, and write the name into ``roles.toml``. force: replace those of a name."""
     name, hosts = request.name, _checked_hosts(request)
     with changing(folder):
@@ -193,7 +193,7 @@ def _refuse_to_replace(folder: Folder, roles: Roles, name: str) -> None:
         raise ConfigError(f"{folder.roles}: names.{name}: exists already; --force replaces it")
 
 
-def _checked_hosts(request: Request) -> tuple[str, ...]:
+def _checked_hosts(request: CertificateRequest) -> tuple[str, ...]:
     check_name("NAME", request.name)
     if request.member.role not in ROLES:
         raise ConfigError(f"--role {request.member.role!r}: expected one of {', '.join(ROLES)}")
@@ -206,7 +206,7 @@ def _checked_hosts(request: Request) -> tuple[str, ...]:
     return hosts
 
 
-def _checked_days(days: int, authority: x509.Authority, now: datetime) -> int:
+def _checked_days(days: int, authority: x509.CertificateAuthority, now: datetime) -> int:
     end = authority.certificate.not_valid_after_utc
     most = (end - now) // timedelta(days=1)
     if not 1 <= days <= most:
@@ -233,7 +233,7 @@ def _issued(certificate: Certificate, replaced_until: datetime | None = None) ->
     return Issued(x509.common_name_of(certificate), expires, x509.fingerprint(certificate), replaced_until)
 
 
-class Entry(msgspec.Struct, frozen=True):
+class ListedCertificate(msgspec.Struct, frozen=True):
     """One name. problem: what is wrong with its files, or that it is revoked; empty: nothing."""
 
     name: str
@@ -245,21 +245,21 @@ class Entry(msgspec.Struct, frozen=True):
     problem: str = ""
 
 
-def list_names(folder: Folder, now: datetime) -> list[Entry]:
+def list_names(folder: Folder, now: datetime) -> list[ListedCertificate]:
     """Return every name in ``roles.toml``, then the revoked ones; raise ConfigError if there is no authority."""
     roles = load_roles(folder.roles)
     authority = load_certificate(folder.ca)
     known = [_entry(folder, authority, roles, name, now) for name in roles.names]
-    return known + [Entry(name, problem="revoked") for name in roles.revoked]
+    return known + [ListedCertificate(name, problem="revoked") for name in roles.revoked]
 
 
-def _entry(folder: Folder, authority: Certificate, roles: Roles, name: str, now: datetime) -> Entry:
+def _entry(folder: Folder, authority: Certificate, roles: Roles, name: str, now: datetime) -> ListedCertificate:
     member = roles.names[name]
     try:
         _, certificate = load_name(folder, name)
     except ConfigError as error:
-        return Entry(name, member.role, member.robots, problem=str(error))
-    return Entry(
+        return ListedCertificate(name, member.role, member.robots, problem=str(error))
+    return ListedCertificate(
         name,
         member.role,
         member.robots,

@@ -39,7 +39,7 @@ _LABEL = r"[a-z0-9_]([a-z0-9_-]{0,61}[a-z0-9_])?"
 _HOST = re.compile(rf"(?=.{{1,253}}$){_LABEL}(\.{_LABEL})*")
 
 
-class Authority(msgspec.Struct, frozen=True):
+class CertificateAuthority(msgspec.Struct, frozen=True):
     """An authority that can sign."""
 
     certificate: x509.Certificate
@@ -51,7 +51,7 @@ def new_key() -> EllipticCurvePrivateKey:
     return generate_private_key(SECP256R1())
 
 
-def new_authority(now: datetime, days: int) -> Authority:
+def new_authority(now: datetime, days: int) -> CertificateAuthority:
     """Make an authority for ``days`` days. Its name is its own: programs tell one authority from another by it."""
     key = new_key()
     number = x509.random_serial_number()
@@ -59,11 +59,11 @@ def new_authority(now: datetime, days: int) -> Authority:
     builder = _builder(name, name, key.public_key(), (now, days), number)
     builder = builder.add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
     builder = builder.add_extension(_usage(signs_certificates=True), critical=True)
-    return Authority(builder.sign(key, hashes.SHA256()), key)
+    return CertificateAuthority(builder.sign(key, hashes.SHA256()), key)
 
 
 def new_certificate(
-    authority: Authority,
+    authority: CertificateAuthority,
     key: EllipticCurvePublicKey,
     common_name: str,
     hosts: tuple[str, ...],

@@ -18,7 +18,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from zbridge.errors import NotReady
-from zbridge.host.fd_channel import Fork, Forked, Message, Post, Ready, close_all
+from zbridge.host.fd_channel import FdChannel, Fork, Forked, Message, Ready, close_all
 from zbridge.host.replacement import NOT_INHERITED, ServerState
 from zbridge.protocol.plugin import GROUP
 
@@ -30,12 +30,12 @@ SETTLED_S = 2.0
 """Seconds for which nothing must have changed: an installer writes file after file."""
 READY_S = 60.0
 """Longest time in which a fork server imports everything."""
-LOOK_S = 2.0
-"""Least time between two looks at the installation, which take 25 ms, for the sake of forks."""
+CHECK_S = 2.0
+"""Least time between two checks of the installation, which take 25 ms, for the sake of forks."""
 FORK_S = 10.0
 """Longest time for one fork."""
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-"""What numpy's libraries must be told, before they are loaded, to start no threads."""
+"""Variables for numpy's libraries, to be set before they are loaded: they must start no threads."""
 
 
 class Stamp:
@@ -60,7 +60,7 @@ class Stamp:
 
     @classmethod
     def of(cls, digest: bytes) -> Stamp:
-        """Make the stamp of an installation that was looked at before."""
+        """Make the stamp of an installation that was checked before."""
         stamp = cls.__new__(cls)
         stamp.digest, stamp.settled = digest, True
         return stamp
@@ -119,18 +119,18 @@ class _Adopted:
 class _Server:
     """One running fork server. Answers come in the order of the requests."""
 
-    def __init__(self, process: subprocess.Popen[bytes] | _Adopted, post: Post, stamp: Stamp) -> None:
+    def __init__(self, process: subprocess.Popen[bytes] | _Adopted, channel: FdChannel, stamp: Stamp) -> None:
         self.stamp = stamp
         self.alive = True
         self._process = process
-        self._post = post
+        self._channel = channel
         self._answers: asyncio.Queue[Message | None] = asyncio.Queue()
-        asyncio.get_running_loop().add_reader(post.fileno(), self._hear)
+        asyncio.get_running_loop().add_reader(channel.fileno(), self._receive)
 
     @classmethod
     def start(cls, command: Sequence[str], stamp: Stamp) -> _Server:
         """Start one; raise OSError."""
-        post, far = Post.pair()
+        channel, far = FdChannel.pair()
         environment = {**os.environ, **ONE_THREAD}
         for name in NOT_INHERITED:
             environment.pop(name, None)
@@ -144,14 +144,14 @@ class _Server:
                     start_new_session=True,
                 )
             except OSError:
-                post.close()
+                channel.close()
                 raise
-        return cls(process, post, stamp)
+        return cls(process, channel, stamp)
 
     @classmethod
     def resume(cls, state: ServerState) -> _Server:
-        """Go on with one that the code before this one has started."""
-        return cls(_Adopted(state.pid), Post.inherited(state.post), Stamp.of(state.stamp))
+        """Resume one that the code before this one has started."""
+        return cls(_Adopted(state.pid), FdChannel.inherited(state.channel), Stamp.of(state.stamp))
 
     @property
     def pid(self) -> int:
@@ -159,7 +159,7 @@ class _Server:
 
     @property
     def state(self) -> ServerState:
-        return ServerState(self.pid, self._post.fileno(), self.stamp.digest)
+        return ServerState(self.pid, self._channel.fileno(), self.stamp.digest)
 
     async def ready(self) -> None:
         """Wait until it can fork; raise NotReady with the reason if it cannot."""
@@ -170,8 +170,8 @@ class _Server:
 
     async def fork(self, request: Fork, descriptors: Sequence[int]) -> int:
         """Fork a gateway and return its process id; raise NotReady with the reason."""
-        if not self._post.send(request, descriptors):
-            raise NotReady("the fork server takes no request")
+        if not self._channel.send(request, descriptors):
+            raise NotReady("the fork server accepts no request")
         answer = await self._answer(FORK_S)
         if not isinstance(answer, Forked) or not answer.pid:
             raise NotReady((isinstance(answer, Forked) and answer.reason) or "the fork server is gone")
@@ -185,9 +185,9 @@ class _Server:
             self.close()
             return None
 
-    def _hear(self) -> None:
+    def _receive(self) -> None:
         try:
-            received = self._post.receive()
+            received = self._channel.receive()
         except (BlockingIOError, ValueError):
             return
         if received is None:
@@ -202,8 +202,8 @@ class _Server:
         """Let it end; idempotent. The gateways that it forked live on."""
         if self.alive:
             self.alive = False
-            asyncio.get_running_loop().remove_reader(self._post.fileno())
-            self._post.close()
+            asyncio.get_running_loop().remove_reader(self._channel.fileno())
+            self._channel.close()
 
     def kill(self) -> None:
         """End it now."""
@@ -218,8 +218,8 @@ class _Server:
         return self._process.poll() is not None
 
 
-class Forks:
-    """Forks gateways by the code that is installed now. One request at a time."""
+class ForkClient:
+    """ForkClient gateways by the code that is installed now. One request at a time."""
 
     def __init__(self, command: Sequence[str]) -> None:
         self._command = command
@@ -228,12 +228,12 @@ class Forks:
         """The installation whose fork server did not start."""
         self._leaving: list[_Server | _Adopted] = []
         self.unsettled = False
-        """Whether the installation was being changed when it was looked at last."""
-        self._looked_at = -math.inf
+        """Whether the installation was being changed when it was checked last."""
+        self._checked_at = -math.inf
         self._turn = asyncio.Lock()
 
     def __repr__(self) -> str:
-        return f"<Forks by {self._server.pid if self._server is not None else None}>"
+        return f"<ForkClient by {self._server.pid if self._server is not None else None}>"
 
     @property
     def pid(self) -> int | None:
@@ -257,14 +257,14 @@ class Forks:
         return self._server.state if self._server is not None and self._server.alive else None, leaving
 
     def resume(self, server: ServerState | None, leaving: Sequence[int]) -> None:
-        """Go on with the fork server that the code before this one has started."""
+        """Resume the fork server that the code before this one has started."""
         self._server = _Server.resume(server) if server is not None else None
         self._leaving = [_Adopted(pid) for pid in leaving]
 
     async def fork(
         self,
         request: Fork,
-        post: socket.socket,
+        channel: socket.socket,
         content: bytes,
         take_over: int | None = None,
         *,
@@ -272,15 +272,15 @@ class Forks:
     ) -> int:
         """Fork a gateway and return its process id; raise NotReady with the reason.
 
-        post: the gateway's end. content: of its file. take_over: descriptor of the socket by which it takes over.
-        at_once: do not look whether the installation has changed.
+        channel: the gateway's end. content: of its file. take_over: descriptor of the socket by which it takes over.
+        at_once: do not check whether the installation has changed.
         """
         loop = asyncio.get_running_loop()
         with _in_memory(content) as file:
-            descriptors = [post.fileno(), file] if take_over is None else [post.fileno(), file, take_over]
+            descriptors = [channel.fileno(), file] if take_over is None else [channel.fileno(), file, take_over]
             async with self._turn:
-                looks = not at_once and loop.time() >= self._looked_at + LOOK_S
-                if looks or self._server is None or not self._server.alive:
+                checks = not at_once and loop.time() >= self._checked_at + CHECK_S
+                if checks or self._server is None or not self._server.alive:
                     await self._renew()
                 assert self._server is not None
                 return await self._server.fork(request, descriptors)
@@ -288,13 +288,13 @@ class Forks:
     async def renew(self) -> None:
         """Start the fork server, or another one if the installation has changed; raise NotReady if there is none.
 
-        A new one that does not start is reported, and the old one goes on.
+        A new one that does not start is reported, and the old one continues.
         """
         async with self._turn:
             await self._renew()
 
     async def _renew(self) -> None:
-        self._looked_at = asyncio.get_running_loop().time()
+        self._checked_at = asyncio.get_running_loop().time()
         self._leaving = [each for each in self._leaving if not each.ended]
         old, stamp = self._server, await asyncio.to_thread(Stamp)
         if old is not None and old.alive:
@@ -310,7 +310,7 @@ class Forks:
             if old is None or not old.alive:
                 raise
             self._refused = stamp
-            log.error("%s: the code of before goes on", error)
+            log.error("%s: the old code continues", error)
             return
         self._server, self._refused = server, None
         if old is not None:

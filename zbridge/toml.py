@@ -5,17 +5,19 @@ Reading never waits for somebody else: only regular files of a bounded size are 
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import stat
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
 from msgspec import inspect
 
-from zbridge.errors import ConfigError
+from zbridge.errors import ConfigError, ZbridgeError
 
 T = TypeVar("T")
 
@@ -68,17 +70,33 @@ def parse_toml(path: Path, content: bytes) -> dict[str, Any]:
         raise ConfigError(f"{path}: not TOML: nested too deeply") from error
 
 
+def read_struct(path: Path, kind: type[T]) -> T:
+    """Make a struct of a TOML file; raise ConfigError, which names file, key, value and what was expected."""
+    raw = read_toml(path)
+    with prefixed(f"{path}: "):
+        return convert(raw, kind)
+
+
+@contextlib.contextmanager
+def prefixed(prefix: str, *errors: type[ZbridgeError]) -> Iterator[None]:
+    """Raise ConfigErrors, and these other errors, as ConfigErrors with a prefix that says where: file or key."""
+    kinds: tuple[type[ZbridgeError], ...] = (ConfigError, *errors)
+    try:
+        yield
+    except kinds as error:
+        raise ConfigError(f"{prefix}{error}") from error
+
+
 def convert(raw: Any, kind: type[T], prefix: str = "") -> T:
     """Make a struct of a table; raise ConfigError, which names key, value and what was expected.
 
     prefix: what stands before the keys of this table, for example ``device.options.``
     """
-    try:
-        return msgspec.convert(raw, kind)
-    except msgspec.ValidationError as error:
-        raise ConfigError(prefix + _explain(raw, kind, str(error))) from error
-    except ConfigError as error:  # options that contradict each other
-        raise ConfigError(f"{prefix}{error}") from error
+    with prefixed(prefix):  # for options that contradict each other, too
+        try:
+            return msgspec.convert(raw, kind)
+        except msgspec.ValidationError as error:
+            raise ConfigError(_explain(raw, kind, str(error))) from error
 
 
 def _explain(raw: Any, kind: type[Any], text: str) -> str:

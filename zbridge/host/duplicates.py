@@ -12,7 +12,7 @@ import logging
 import os
 import socket
 import stat
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import msgspec
 
@@ -98,18 +98,14 @@ class Duplicate(msgspec.Struct):
             return own.sendto(data, socket.MSG_DONTWAIT, robot.getpeername()) == len(data)
 
 
-class _borrowed:  # noqa: N801 - reads as a function
-    """A socket object for a descriptor that stays open."""
-
-    def __init__(self, descriptor: int) -> None:
-        self._descriptor = descriptor
-
-    def __enter__(self) -> socket.socket:
-        self._socket = socket.socket(fileno=self._descriptor)
-        return self._socket
-
-    def __exit__(self, *_: object) -> None:
-        self._socket.detach()
+@contextlib.contextmanager
+def _borrowed(descriptor: int) -> Iterator[socket.socket]:
+    """Make a socket object for a descriptor that stays open."""
+    borrowed = socket.socket(fileno=descriptor)
+    try:
+        yield borrowed
+    finally:
+        borrowed.detach()
 
 
 class Duplicates:
@@ -174,7 +170,7 @@ class Duplicates:
     async def drain(self) -> None:
         """Close all, but first let the robot read its stop: the kernel would reset what is closed with bytes unread.
 
-        A robot whose own sending is held up goes on when that is read.
+        A robot whose own sending is stalled continues when that is read.
         """
         loop = asyncio.get_running_loop()
         ends_at = loop.time() + LEAVE_S

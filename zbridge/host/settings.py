@@ -14,7 +14,7 @@ import msgspec
 from zbridge.app.config import GatewayPlan
 from zbridge.errors import ConfigError
 from zbridge.host.addresses import Addresses, resolve
-from zbridge.toml import FILE_BYTES, convert, read_toml
+from zbridge.toml import FILE_BYTES, read_struct
 
 HOST_FILE = "host.toml"
 """The file of a directory that is no robot's."""
@@ -41,13 +41,7 @@ class _HostFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def load_host(directory: Path) -> HostSettings:
     """Read ``host.toml`` of a directory; the defaults where there is none. Raises ConfigError, which names the file."""
     path = directory / HOST_FILE
-    if not path.exists():
-        return HostSettings()
-    raw = read_toml(path)
-    try:
-        return convert(raw, _HostFile).host
-    except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from error
+    return read_struct(path, _HostFile).host if path.exists() else HostSettings()
 
 
 def robot_files(directory: Path) -> list[Path]:

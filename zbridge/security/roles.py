@@ -16,7 +16,7 @@ import msgspec
 
 from zbridge.errors import ConfigError
 from zbridge.fleet.topics import is_name
-from zbridge.toml import convert, read_toml
+from zbridge.toml import convert, prefixed, read_toml
 
 Role = Literal["viewer", "operator", "supervisor", "gateway", "hq", "recorder", "router"]
 ROLES: tuple[Role, ...] = get_args(Role)
@@ -78,12 +78,10 @@ def common_name(name: str, role: Role) -> str:
 def load_roles(path: Path) -> Roles:
     """Read ``roles.toml``; raise ConfigError, which names file, key, value and what was expected."""
     raw = read_toml(path, ROLES_BYTES)
-    try:
+    with prefixed(f"{path}: "):
         file = convert(raw, _RolesFile)
         names = {name: convert(table, Member, f"names.{name}.") for name, table in file.names.items()}
         return _checked(Roles(names, file.revoked))
-    except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from error
 
 
 def save_roles(path: Path, roles: Roles) -> None:

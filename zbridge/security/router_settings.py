@@ -22,7 +22,7 @@ from zbridge.fleet.topics import is_name
 from zbridge.protocol.networks import is_loopback
 from zbridge.security.access import MESSAGE_BYTES, STOPS_HZ, access_control, downsampling, low_pass_filter
 from zbridge.security.roles import Roles, load_roles
-from zbridge.toml import convert, read_toml
+from zbridge.toml import read_struct
 
 LISTEN = "tcp/127.0.0.1:7447"
 LISTEN_TLS = "tls/0.0.0.0:7447"
@@ -73,15 +73,10 @@ class RouterPlan(msgspec.Struct, frozen=True):
 
 def load_router(path: Path) -> RouterSettings:
     """Read a router's TOML file; raise ConfigError, which names the file as well."""
-    raw = read_toml(path)
-    try:
-        settings = convert(raw, RouterSettings)
-    except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from error
+    settings = read_struct(path, RouterSettings)
     beside = path.absolute().parent
-    tls, roles = settings.tls, settings.roles
-    if tls is not None:
-        tls = tls_beside(tls, beside)
+    tls = tls_beside(settings.tls, beside) if settings.tls is not None else None
+    roles = settings.roles
     return msgspec.structs.replace(settings, tls=tls, roles=None if roles is None else str(beside / roles))
 
 

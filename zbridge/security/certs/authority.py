@@ -28,10 +28,11 @@ from zbridge.security.certs.files import (
     write,
 )
 from zbridge.security.roles import ROLES, Member, Roles, check_member, check_name, load_roles, save_roles
+from zbridge.toml import prefixed
 
 AUTHORITY_DAYS = 3650
 DAYS = 365
-"""How long a certificate is valid, unless told otherwise."""
+"""How long a certificate is valid, by default."""
 SOON = timedelta(days=30)
 """How long before its end a certificate is due to be renewed."""
 
@@ -39,10 +40,8 @@ SOON = timedelta(days=30)
 def load_certificate(path: Path) -> Certificate:
     """Read a certificate; raise ConfigError."""
     content = read(path)
-    try:
+    with prefixed(f"{path}: "):
         return x509.read_certificate(content)
-    except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from error
 
 
 def load_authority(folder: Folder, now: datetime) -> x509.CertificateAuthority:
@@ -78,10 +77,8 @@ def fault(certificate: Certificate, authority: Certificate, expected: str, now: 
 
 def _matching_key(path: Path, certificate: Certificate) -> EllipticCurvePrivateKey:
     content = read_secret(path)
-    try:
+    with prefixed(f"{path}: "):
         key = x509.read_key(content)
-    except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from error
     if not x509.belongs_to(certificate, key):
         raise ConfigError(f"{path}: not the key of the certificate {x509.common_name_of(certificate)!r} beside it")
     return key

@@ -1,4 +1,4 @@
-"""The files of an authority: where each stands, written whole or not at all; keys for their owner alone."""
+"""The files of an authority: where each is, written whole or not at all; keys for their owner alone."""
 
 from __future__ import annotations
 
@@ -81,16 +81,14 @@ def changing(folder: Folder) -> Iterator[None]:
 
 def make_folder(path: Path) -> None:
     """Make a folder that only its owner may enter, if there is none yet; raise ConfigError."""
-    try:
+    with _named(path):
         path.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror or error}") from error
 
 
 def write(path: Path, content: bytes, mode: int) -> None:
     """Replace a file as a whole; raise ConfigError. A secret is never readable by others, not even meanwhile."""
     new = path.with_name(f".{path.name}.new")
-    try:
+    with _named(path):
         new.unlink(missing_ok=True)
         descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
         with os.fdopen(descriptor, "wb") as file:
@@ -99,29 +97,32 @@ def write(path: Path, content: bytes, mode: int) -> None:
             file.flush()
             os.fsync(descriptor)
         new.replace(path)
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror or error}") from error
 
 
 def read(path: Path) -> bytes:
     """Read a file; raise ConfigError, which names it."""
-    try:
+    with _named(path):
         return path.read_bytes()
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror or error}") from error
 
 
 def read_secret(path: Path) -> bytes:
     """Read a key; raise ConfigError also if anybody but its owner may read or write the file."""
-    try:
+    with _named(path):
         mode = path.stat().st_mode & 0o777
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror or error}") from error
     if mode & _OTHERS:
         raise ConfigError(
             f"{path}: others can read or write this key (mode {mode:04o}): expected 0600. If somebody did, it is lost."
         )
     return read(path)
+
+
+@contextlib.contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Raise an OSError as a ConfigError that names the file."""
+    try:
+        yield
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror or error}") from error
 
 
 def refuse_to_overwrite(*paths: Path, advice: str) -> None:

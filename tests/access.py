@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import zenoh
 
-from zbridge.app.access import Column, Kind, column, granted
-from zbridge.app.roles import Member, Roles
+from zbridge.security.access import Column, MessageKind, column, granted
+from zbridge.security.roles import Member, Roles
 
 REALM = "fleet"
 OWN, OTHER = "r1", "r2"
@@ -82,7 +82,7 @@ class Try(NamedTuple):
 
     column: Column
     path: str
-    kind: Kind
+    kind: MessageKind
     robot: str | None
 
     @property
@@ -99,7 +99,7 @@ def tries() -> list[Try]:
         for paths, robots in ((PATHS, (OWN, OTHER)), (OTHERS, (None,)))
         for path in paths
         for robot in robots
-        for kind in Kind
+        for kind in MessageKind
     ]
 
 
@@ -122,23 +122,23 @@ def granted_by_the_code(roles: Roles = LAB) -> set[Try]:
     }
 
 
-WORDS: tuple[tuple[str, tuple[Kind, ...]], ...] = (
-    ("everything", tuple(Kind)),
-    ("put", (Kind.PUT,)),
-    ("delete", (Kind.DELETE,)),
-    ("subscribe", (Kind.SUBSCRIBE,)),
-    ("query", (Kind.QUERY,)),
-    ("answer", (Kind.QUERYABLE, Kind.REPLY)),
-    ("offer", (Kind.QUERYABLE,)),
-    ("reply", (Kind.REPLY,)),
-    ("token", (Kind.TOKEN,)),
-    ("see", (Kind.ASK_ALIVE, Kind.WATCH_ALIVE)),
-    ("ask alive", (Kind.ASK_ALIVE,)),
-    ("watch alive", (Kind.WATCH_ALIVE,)),
+WORDS: tuple[tuple[str, tuple[MessageKind, ...]], ...] = (
+    ("everything", tuple(MessageKind)),
+    ("put", (MessageKind.PUT,)),
+    ("delete", (MessageKind.DELETE,)),
+    ("subscribe", (MessageKind.SUBSCRIBE,)),
+    ("query", (MessageKind.QUERY,)),
+    ("answer", (MessageKind.QUERYABLE, MessageKind.REPLY)),
+    ("offer", (MessageKind.QUERYABLE,)),
+    ("reply", (MessageKind.REPLY,)),
+    ("token", (MessageKind.TOKEN,)),
+    ("see", (MessageKind.ASK_ALIVE, MessageKind.WATCH_ALIVE)),
+    ("ask alive", (MessageKind.ASK_ALIVE,)),
+    ("watch alive", (MessageKind.WATCH_ALIVE,)),
 )
 
 
-def in_words(kinds: set[Kind]) -> list[str]:
+def in_words(kinds: set[MessageKind]) -> list[str]:
     left, words = set(kinds), []
     for word, meant in WORDS:
         if left.issuperset(meant):
@@ -147,7 +147,7 @@ def in_words(kinds: set[Kind]) -> list[str]:
     return words
 
 
-def cell(allowed: Callable[[str | None], set[Kind]], robots: tuple[str | None, ...]) -> str:
+def cell(allowed: Callable[[str | None], set[MessageKind]], robots: tuple[str | None, ...]) -> str:
     """Write what is allowed on a path: of all robots, and of the own one only."""
     of_all = set.intersection(*map(allowed, robots))
     own = allowed(robots[0]) - of_all
@@ -166,7 +166,7 @@ def table(allowed: set[Try]) -> str:
             cells = tuple(
                 cell(
                     lambda robot, column=column, path=path: {
-                        kind for kind in Kind if Try(column, path, kind, robot) in allowed
+                        kind for kind in MessageKind if Try(column, path, kind, robot) in allowed
                     },
                     robots,
                 )

@@ -25,7 +25,7 @@ cp -a /opt/zbridge before # the program that requests the restart has a version 
 since=$(now)
 install --wheels later-0.1.2/zbridge-0.1.2-py3-none-any.whl --extras "" --router
 systemctl reload zbridge
-within 60 said zbridge "$since" "the code of before goes on\|goes on with the code of before" || fail "the log does not report a broken version"
+within 60 said zbridge "$since" "the old code continues\|continues with the old code" || fail "the log does not report a broken version"
 before/bin/python -m zbridge restart --all --tls boss >restart.log 2>&1 || { cat restart.log; fail "zbridge restart failed with the previous code"; }
 established r1 r2 && one_connection r1 && runs 0.1.1 || fail "a broken version disturbed r1"
 [ "$(of MainPID zbridge)" = "$main" ] && is NRestarts zbridge "$starts" || fail "the unit was restarted"

@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from zbridge.app import config
-from zbridge.app.config import Plan, load, plan
+from zbridge.app.config import GatewayPlan, load, plan
 from zbridge.app.templates import listener_template, robot_template
 from zbridge.bus import Tls
 from zbridge.control.settings import ControlSettings
@@ -44,7 +44,7 @@ def hq(**fields: Any) -> dict[str, Any]:
     return {"protocol": "tcpudp", "listen": "tcp://127.0.0.1:11002", **fields}
 
 
-def loaded(folder: Path, text: str, **environment: str) -> Plan:
+def loaded(folder: Path, text: str, **environment: str) -> GatewayPlan:
     file = folder / "robot.toml"
     file.write_text(text, encoding="utf-8")
     return load(file, environment)

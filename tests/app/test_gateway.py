@@ -19,7 +19,7 @@ from tests.clock import jumping
 from tests.proofs import Holder
 from zbridge.app.config import plan
 from zbridge.app.gateway import Gateway
-from zbridge.app.handover.messages import VERSION, Given
+from zbridge.app.handover.channel import VERSION, HandoverState
 from zbridge.app.joining import RETRY_S, join_bus
 from zbridge.app.tasks import until_signal
 from zbridge.bus import Bus, Handle
@@ -116,10 +116,10 @@ async def test_the_successor_of_a_gateway_that_died_binds_listeners_of_its_own()
     with near, far:
         gateway = Gateway(plan({"robot": {"name": "r1"}, "device": NOWHERE, "hq": [listener]}), predecessor=far)
         assert gateway._incoming is not None
-        gateway._incoming.given = Given(VERSION, {}, 0, claim={"since": 1.0}, device={"links": []})
+        gateway._incoming.state = HandoverState(VERSION, {}, 0, claim={"since": 1.0}, device={"links": []})
         bus = FakeBus("1")
         (made,) = gateway._listeners(bus, RobotSubscription(bus, KeySpace("fleet", "r1"), Metrics()))
-        running = asyncio.create_task(made.run(gateway._incoming.taken))
+        running = asyncio.create_task(made.run(gateway._incoming.part_taken_over))
         async with asyncio.timeout(SOON_S):
             await made.ready.wait()  # HQ programs are accepted: there is nothing to be taken over
         running.cancel()

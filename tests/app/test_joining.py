@@ -7,7 +7,7 @@ import logging
 
 import pytest
 
-from zbridge.app.config import Plan, plan
+from zbridge.app.config import GatewayPlan, plan
 from zbridge.app.gateway import Gateway
 from zbridge.app.joining import RECONNECTS_S, STUCK_S, SessionUseless, watch_session
 from zbridge.app.runtime import Runtime
@@ -21,7 +21,7 @@ ROUTER = {"connect": ["tcp/127.0.0.1:1"]}
 WHILE_S = 600.0
 
 
-def planned(**bus: object) -> Plan:
+def planned(**bus: object) -> GatewayPlan:
     device = {"protocol": "tcpudp", "connect": ["tcp://127.0.0.1:1"]}
     return plan({"robot": {"name": "r1"}, "device": device, "bus": {**ROUTER, **bus}})
 
@@ -33,7 +33,7 @@ class Scene:
         self.bus, self.router, self.tried = FakeBus(), router, 0
         self.watching = asyncio.create_task(watch_session(planned(), self.bus, self.try_second))
 
-    async def try_second(self, _: Plan) -> bool:
+    async def try_second(self, _: GatewayPlan) -> bool:
         self.tried += 1
         return self.router
 
@@ -78,11 +78,11 @@ async def test_a_gateway_leaves_a_useless_session_and_serves_on_a_new_one(
 ) -> None:
     buses: list[FakeBus] = []
 
-    async def join(_: Plan, __: Metrics) -> Bus:
+    async def join(_: GatewayPlan, __: Metrics) -> Bus:
         buses.append(FakeBus(f"{len(buses)}"))
         return buses[-1]
 
-    async def can_connect(_: Plan) -> bool:
+    async def can_connect(_: GatewayPlan) -> bool:
         return True
 
     gateway = Gateway(planned(mode=mode), runtime=Runtime(join=join, can_connect=can_connect))

@@ -14,8 +14,8 @@ from pathlib import Path
 
 from tests.benchmarks.peer import tell
 from zbridge.app import Gateway, load
-from zbridge.app.host import HostSettings, robot_files
 from zbridge.cli import run_loop
+from zbridge.host.settings import HostSettings, robot_files
 
 STAGGER_S = HostSettings().stagger_s
 

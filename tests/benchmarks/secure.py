@@ -32,7 +32,7 @@ from tests.benchmarks.peer import ROBOT
 from tests.certificates import Authority
 from tests.e2e.secure import FAR, SecureBus
 from tests.ports import free_port
-from zbridge.app.roles import Member, Roles, save_roles
+from zbridge.security.roles import Member, Roles, save_roles
 
 RATE_HZ = 1000.0
 TURNS, SESSIONS = 7, 200

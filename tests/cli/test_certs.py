@@ -1,4 +1,4 @@
-"""``zbridge certs`` as it is typed: what it prints, and its exit codes. ``tests/app/certs`` looks at what it makes."""
+"""``zbridge certs`` as it is typed: what it prints, and its exit codes; ``tests/security/certs`` checks the files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from zbridge import cli
-from zbridge.app.roles import Member, load_roles
+from zbridge.security.roles import Member, load_roles
 
 PAGE = Path(__file__).parents[2] / "docs" / "security.md"
 RESTART = "Restart the router, which reads roles.toml when it starts. That loses the bus: every driven robot stops.\n"
@@ -190,5 +190,6 @@ def test_a_missing_package_is_named_with_the_extra(terminal: Terminal, monkeypat
 
 
 def test_other_commands_do_not_load_the_package() -> None:
-    code = "import sys, zbridge.cli.app; sys.exit('cryptography' in sys.modules or 'zbridge.app.certs' in sys.modules)"
+    modules = "'cryptography' in sys.modules or 'zbridge.security.certs' in sys.modules"
+    code = f"import sys, zbridge.cli.app; sys.exit({modules})"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from tests.access import LAB
-from zbridge.app.roles import save_roles
 from zbridge.bus import Tls
 from zbridge.cli.router import run_router, settings_of
 from zbridge.errors import ConfigError
+from zbridge.security.roles import save_roles
 
 DEPLOYED = Path(__file__).parents[2] / "deploy" / "zenoh"
 

@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 
 from zbridge import cli
-from zbridge.app.host import HostSettings
-from zbridge.app.together import Together
 from zbridge.errors import ConfigError
+from zbridge.host.settings import HostSettings
+from zbridge.host.together import Together
 
 ROBOT = '[robot]\nname = "{0}"\n[device]\nprotocol = "tcpudp"\nconnect = ["tcp://{0}.test:1"]\n{1}'
 HOST = HostSettings(together=True)

@@ -24,8 +24,8 @@ from tests.certificates import Authority
 from tests.e2e.conftest import HOST, WAIT_S, until
 from tests.machine import Patience
 from tests.ports import free_port
-from zbridge.app.access import Column, Keys, Kind, expressions
-from zbridge.app.roles import Member, Roles, save_roles
+from zbridge.security.access import Column, Keys, MessageKind, expressions
+from zbridge.security.roles import Member, Roles, save_roles
 
 FAR = "far"
 GRACE_S = 0.3
@@ -114,7 +114,9 @@ class Matrix:
         self.seen: set[Try] = set()
         self._expected = granted_by_the_code()
         self._lock = threading.Lock()
-        self._by: dict[tuple[str, str, Kind], Try] = {(each.column, each.key, each.kind): each for each in tries()}
+        self._by: dict[tuple[str, str, MessageKind], Try] = {
+            (each.column, each.key, each.kind): each for each in tries()
+        }
         self.keys = sorted({each.key for each in tries()})
 
     def run(self) -> set[Try]:
@@ -125,13 +127,13 @@ class Matrix:
         self._looks()
         return self.seen
 
-    def _note(self, column: str, key: str, kind: Kind) -> None:
+    def _note(self, column: str, key: str, kind: MessageKind) -> None:
         with self._lock:
             each = self._by.get((column, key, kind))
             if each is not None:
                 self.seen.add(each)
 
-    def _wait(self, *kinds: Kind, column: str | None = None, send: Callable[[], None] = lambda: None) -> None:
+    def _wait(self, *kinds: MessageKind, column: str | None = None, send: Callable[[], None] = lambda: None) -> None:
         """Send, and wait for what is allowed, as long as that may take; then a while for what is not.
 
         On a busy machine Zenoh drops some: replies to liveliness queries, and what comes before a declaration has
@@ -148,26 +150,26 @@ class Matrix:
                 break
         time.sleep(GRACE_S)
 
-    def _of(self, kind: Kind) -> Iterator[tuple[Try, zenoh.Session]]:
+    def _of(self, kind: MessageKind) -> Iterator[tuple[Try, zenoh.Session]]:
         for each in tries():
             if each.kind is kind:
                 yield each, self.members[each.column]
 
     def _puts_and_queries(self) -> None:
         def sample(sample: zenoh.Sample) -> None:
-            kind = Kind.PUT if sample.kind == zenoh.SampleKind.PUT else Kind.DELETE
+            kind = MessageKind.PUT if sample.kind == zenoh.SampleKind.PUT else MessageKind.DELETE
             self._note(text(sample.attachment), str(sample.key_expr), kind)
 
         def query(query: zenoh.Query) -> None:
-            self._note(text(query.payload), str(query.key_expr), Kind.QUERY)
+            self._note(text(query.payload), str(query.key_expr), MessageKind.QUERY)
             query.drop()
 
         def send() -> None:
-            for each, session in self._of(Kind.PUT):
+            for each, session in self._of(MessageKind.PUT):
                 session.put(each.key, b"", attachment=each.column, congestion_control=BLOCK)
-            for each, session in self._of(Kind.DELETE):
+            for each, session in self._of(MessageKind.DELETE):
                 session.delete(each.key, attachment=each.column, congestion_control=BLOCK)
-            for each, session in self._of(Kind.QUERY):
+            for each, session in self._of(MessageKind.QUERY):
                 session.get(each.key, ignore, payload=each.column, timeout=WAIT_S, target=zenoh.QueryTarget.ALL)
 
         with declared(
@@ -175,13 +177,13 @@ class Matrix:
             *(self.far.declare_queryable(each, query) for each in EVERYTHING),
         ):
             time.sleep(GRACE_S)
-            self._wait(Kind.PUT, Kind.DELETE, Kind.QUERY, send=send)
+            self._wait(MessageKind.PUT, MessageKind.DELETE, MessageKind.QUERY, send=send)
 
     def _subscribers(self) -> None:
         def heard(column: Column) -> Callable[[zenoh.Sample], None]:
             def sample(sample: zenoh.Sample) -> None:
                 if text(sample.attachment) == FAR:
-                    self._note(column, str(sample.key_expr), Kind.SUBSCRIBE)
+                    self._note(column, str(sample.key_expr), MessageKind.SUBSCRIBE)
 
             return sample
 
@@ -190,16 +192,19 @@ class Matrix:
                 self.far.put(key, b"", attachment=FAR, congestion_control=BLOCK)
 
         with declared(
-            *(session.declare_subscriber(each.key, heard(each.column)) for each, session in self._of(Kind.SUBSCRIBE))
+            *(
+                session.declare_subscriber(each.key, heard(each.column))
+                for each, session in self._of(MessageKind.SUBSCRIBE)
+            )
         ):
             time.sleep(GRACE_S)
-            self._wait(Kind.SUBSCRIBE, send=send)
+            self._wait(MessageKind.SUBSCRIBE, send=send)
 
     def _queryables(self) -> None:
         def asked(column: Column, key: str) -> Callable[[zenoh.Query], None]:
             def query(query: zenoh.Query) -> None:
                 if text(query.payload) == FAR:
-                    self._note(column, key, Kind.QUERYABLE)
+                    self._note(column, key, MessageKind.QUERYABLE)
                     query.reply(key, column)
                 query.drop()
 
@@ -207,7 +212,7 @@ class Matrix:
 
         def replied(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
-                self._note(text(reply.ok.payload), str(reply.ok.key_expr), Kind.REPLY)
+                self._note(text(reply.ok.payload), str(reply.ok.key_expr), MessageKind.REPLY)
 
         def send() -> None:
             for key in self.keys:
@@ -223,11 +228,11 @@ class Matrix:
         with declared(
             *(
                 session.declare_queryable(each.key, asked(each.column, each.key))
-                for each, session in self._of(Kind.QUERYABLE)
+                for each, session in self._of(MessageKind.QUERYABLE)
             )
         ):
             time.sleep(GRACE_S)
-            self._wait(Kind.QUERYABLE, Kind.REPLY, send=send)
+            self._wait(MessageKind.QUERYABLE, MessageKind.REPLY, send=send)
 
     def _tokens(self) -> None:
         now: list[Column] = []
@@ -236,7 +241,7 @@ class Matrix:
         def changed(sample: zenoh.Sample) -> None:
             if sample.kind == zenoh.SampleKind.PUT:
                 alive.add(str(sample.key_expr))
-                self._note(now[-1], str(sample.key_expr), Kind.TOKEN)
+                self._note(now[-1], str(sample.key_expr), MessageKind.TOKEN)
             else:
                 alive.discard(str(sample.key_expr))
 
@@ -245,39 +250,39 @@ class Matrix:
             time.sleep(GRACE_S)
             for column, session in self.members.items():  # one after the other: a token does not say whose it is
                 now.append(column)
-                keys = [each.key for each, _ in self._of(Kind.TOKEN) if each.column == column]
+                keys = [each.key for each, _ in self._of(MessageKind.TOKEN) if each.column == column]
                 with declared(*(session.liveliness().declare_token(key) for key in keys)):
-                    self._wait(Kind.TOKEN, column=column)
+                    self._wait(MessageKind.TOKEN, column=column)
                 until(lambda: not alive, what="the end of the tokens")
 
     def _looks(self) -> None:
         def came(column: Column) -> Callable[[zenoh.Sample], None]:
             def change(sample: zenoh.Sample) -> None:
-                self._note(column, str(sample.key_expr), Kind.WATCH_ALIVE)
+                self._note(column, str(sample.key_expr), MessageKind.WATCH_ALIVE)
 
             return change
 
         def found(column: Column) -> Callable[[zenoh.Reply], None]:
             def reply(reply: zenoh.Reply) -> None:
                 if reply.ok is not None:
-                    self._note(column, str(reply.ok.key_expr), Kind.ASK_ALIVE)
+                    self._note(column, str(reply.ok.key_expr), MessageKind.ASK_ALIVE)
 
             return reply
 
         def send() -> None:
-            for each, session in self._of(Kind.ASK_ALIVE):
+            for each, session in self._of(MessageKind.ASK_ALIVE):
                 session.liveliness().get(each.key, found(each.column), timeout=WAIT_S)
 
         with declared(
             *(
                 session.liveliness().declare_subscriber(each.key, came(each.column))
-                for each, session in self._of(Kind.WATCH_ALIVE)
+                for each, session in self._of(MessageKind.WATCH_ALIVE)
             )
         ):
             time.sleep(GRACE_S)
             with declared(*(self.far.liveliness().declare_token(key) for key in self.keys)):
-                self._wait(Kind.WATCH_ALIVE)
-                self._wait(Kind.ASK_ALIVE, send=send)
+                self._wait(MessageKind.WATCH_ALIVE)
+                self._wait(MessageKind.ASK_ALIVE, send=send)
 
 
 def ignore(_: object) -> None:

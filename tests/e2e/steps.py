@@ -16,8 +16,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from zbridge.app.handover.channel import Channel
-from zbridge.app.handover.messages import Given, Go, Hello, Message, Up
+from zbridge.app.handover.channel import Go, HandoverChannel, HandoverState, Hello, Message, Up
 from zbridge.app.handover.processes import PROCESSES
 from zbridge.protocol.session import Role
 from zbridge.transport import Conversation, Parcel
@@ -100,18 +99,18 @@ def _come(of: Of, step: str) -> None:
             os.kill(os.getpid(), int(number))
 
 
-def _pair() -> tuple[Channel, socket.socket]:
+def _pair() -> tuple[HandoverChannel, socket.socket]:
     near, far = socket.socketpair()
     return _Outgoing(near), far
 
 
-class _Outgoing(Channel):
+class _Outgoing(HandoverChannel):
     def _send(self, message: Message, parcel: Parcel | None) -> None:
         if isinstance(message, Go):
             _come(Of.PREDECESSOR, BEFORE_GO)
         super()._send(message, parcel)
-        if isinstance(message, Given | Go):
-            _come(Of.PREDECESSOR, AFTER_GIVEN if isinstance(message, Given) else AFTER_GO)
+        if isinstance(message, HandoverState | Go):
+            _come(Of.PREDECESSOR, AFTER_GIVEN if isinstance(message, HandoverState) else AFTER_GO)
 
     def _receive(self, kind: type[M], timeout_s: float | None) -> M:
         if kind is Hello:
@@ -122,7 +121,7 @@ class _Outgoing(Channel):
         return message
 
 
-class _Incoming(Channel):
+class _Incoming(HandoverChannel):
     def _send(self, message: Message, parcel: Parcel | None) -> None:
         if isinstance(message, Hello):
             _come(Of.SUCCESSOR, BEFORE_HELLO)
@@ -132,7 +131,7 @@ class _Incoming(Channel):
 
     def _receive(self, kind: type[M], timeout_s: float | None) -> M:
         message: Any = super()._receive(kind, timeout_s)
-        if kind is Given:
+        if kind is HandoverState:
             _come(Of.SUCCESSOR, AFTER_GIVEN)
         if kind is Go:
             global _has_gone

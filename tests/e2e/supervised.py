@@ -18,12 +18,12 @@ from tests.e2e import steps
 from tests.e2e.conftest import WAIT_S, end, until
 from tests.e2e.processes import ROOT, module
 from zbridge.app import until_signal
-from zbridge.app.host import HostSettings
-from zbridge.app.supervisor.fork_server import Birth, serve
-from zbridge.app.supervisor.post import Post
-from zbridge.app.supervisor.supervisor import Supervisor
 from zbridge.cli import set_up_log
 from zbridge.cli.fork_server import run
+from zbridge.host.fd_channel import FdChannel
+from zbridge.host.fork_server import Birth, serve
+from zbridge.host.settings import HostSettings
+from zbridge.host.supervisor import Supervisor
 
 FORKS = "forks"
 
@@ -108,7 +108,7 @@ def hang(birth: Birth) -> int:
 def main() -> None:
     if sys.argv[1] == FORKS:
         steps.watch(Path(sys.argv[2]))
-        serve(Post.inherited(int(sys.argv[3])), hang)
+        serve(FdChannel.inherited(int(sys.argv[3])), hang)
         return
     set_up_log(verbose=False)
     folder = Path(sys.argv[1])

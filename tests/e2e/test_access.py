@@ -19,9 +19,8 @@ from tests.access import COLUMNS, LAB, Try, granted_by_the_code, table
 from tests.certificates import Authority
 from tests.e2e.conftest import until
 from tests.e2e.secure import FAR, GRACE_S, ROLES, Matrix, SecureBus, declared, ignore, secure, text
-from zbridge.app.access import Column
-from zbridge.app.access_rules import STOPS_HZ
-from zbridge.app.roles import Roles
+from zbridge.security.access import STOPS_HZ, Column
+from zbridge.security.roles import Roles
 
 PAGE = Path(__file__).parents[2] / "docs" / "security.md"
 

@@ -15,17 +15,17 @@ import pytest
 import zenoh
 
 from tests.ports import free_port
-from zbridge.app.certs import authority
-from zbridge.app.certs.authority import Request
-from zbridge.app.certs.bundle import Packing, bundle
-from zbridge.app.certs.files import Folder, NameFiles
-from zbridge.app.roles import Member
 from zbridge.bus import BusSettings, open_bus
 from zbridge.errors import BusError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Pose
 from zbridge.metrics import Metrics
+from zbridge.security.certs import authority
+from zbridge.security.certs.authority import CertificateRequest
+from zbridge.security.certs.bundle import Packing, bundle
+from zbridge.security.certs.files import Folder, NameFiles
+from zbridge.security.roles import Member
 
 KEY = "fleet/r1/pose"
 
@@ -51,7 +51,7 @@ def new_lab(path: Path, port: int) -> Lab:
         ("g1", Member("gateway", ("r1",)), ()),
         ("ann", Member("viewer"), ()),
     ):
-        authority.issue(folder, Request(name, member, hosts), now)
+        authority.issue(folder, CertificateRequest(name, member, hosts), now)
     return Lab(folder, port)
 
 
@@ -153,6 +153,6 @@ async def test_a_viewer_cannot_pose_as_a_router(lab: Lab) -> None:
 
 async def test_a_router_is_refused_under_a_host_that_its_certificate_does_not_name(lab: Lab) -> None:
     now = datetime.now(UTC)
-    authority.issue(lab.folder, Request("far", Member("router"), ("hub.lab",)), now)
+    authority.issue(lab.folder, CertificateRequest("far", Member("router"), ("hub.lab",)), now)
     with routing(lab.folder.of("far"), lab.port):
         assert await refused(lab.settings("g1"))

@@ -21,14 +21,14 @@ from tests.e2e.test_certs import routing
 from tests.machine import Patience
 from tests.ports import free_port
 from zbridge.app import Gateway, load
-from zbridge.app.certs import authority
-from zbridge.app.certs.authority import Request
-from zbridge.app.certs.files import Folder
-from zbridge.app.member import check_member
-from zbridge.app.roles import Member
 from zbridge.bus import BusSettings
 from zbridge.cli.bus import list_robots
 from zbridge.errors import BusError, ConfigError
+from zbridge.security.certs import authority
+from zbridge.security.certs.authority import CertificateRequest
+from zbridge.security.certs.files import Folder
+from zbridge.security.member import check_member
+from zbridge.security.roles import Member
 
 DAY = timedelta(days=1)
 ENDS_S = 8
@@ -44,19 +44,19 @@ class Lab:
         self.port, self.plain, self.false, self.silent, self.nobody = (free_port() for _ in range(5))
         self.now = datetime.now(UTC)
         authority.init(self.folder, self.now)
-        authority.issue(self.folder, Request("hub", Member("router"), (HOST,)), self.now)
+        authority.issue(self.folder, CertificateRequest("hub", Member("router"), (HOST,)), self.now)
         for name in ("ann", "old", "young", "short"):
             self.issue(name)
         authority.renew(self.folder, "old", self.now - 2 * DAY, days=1)
         authority.renew(self.folder, "young", self.now + 2 * DAY)
         self.other = Folder(path / "other")
         authority.init(self.other, self.now)
-        authority.issue(self.other, Request("ann", GATEWAY), self.now)
+        authority.issue(self.other, CertificateRequest("ann", GATEWAY), self.now)
         self.mixed("knowing", self.other, ca=self.folder.ca)
         self.mixed("mismatched", self.folder, key=self.folder.of("old").key)
 
     def issue(self, name: str) -> None:
-        authority.issue(self.folder, Request(name, GATEWAY), self.now)
+        authority.issue(self.folder, CertificateRequest(name, GATEWAY), self.now)
 
     def here(self, common_name: str) -> bool:
         """Tell whether a member is connected, as the router says."""

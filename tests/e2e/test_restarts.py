@@ -19,7 +19,7 @@ from tests.e2e.processes import ROOT
 from tests.e2e.restarts import MOST_GAP_S, ROBOTS, Restarted, restart
 from tests.e2e.robots import MOVE, STOP, Robot
 from tests.ports import free_port
-from zbridge.app.handover.messages import VERSION
+from zbridge.app.handover.channel import VERSION
 
 
 @pytest.mark.parametrize("protocol", ROBOTS)
@@ -130,15 +130,15 @@ def test_a_successor_that_finds_a_bad_file_leaves_the_gateway_as_it_was(bench: B
 FAKE = """
 import os, socket, sys, time
 sys.path.insert(0, {root!r})
-from zbridge.app.handover import messages
-from zbridge.app.handover.channel import Channel
+from zbridge.app.handover import channel as messages
+from zbridge.app.handover.channel import HandoverChannel
 descriptor = int(sys.argv[sys.argv.index("--take-over") + 1])
-channel = Channel(socket.socket(fileno=descriptor))
+channel = HandoverChannel(socket.socket(fileno=descriptor))
 how = {how!r}
 if how == "silent":
     time.sleep(60)
 channel._send(messages.Hello(9 if how == "newer" else messages.VERSION, os.getpid()), None)
-given = channel._receive(messages.Given, 30)
+given = channel._receive(messages.HandoverState, 30)
 if how == "crash":
     os.kill(os.getpid(), 9)
 parcel = channel._receive_parcel(given.descriptors, 5)
@@ -150,10 +150,10 @@ time.sleep(60)
 @pytest.mark.parametrize(
     ("how", "reason"),
     [
-        ("silent", "says nothing"),
+        ("silent", "sent nothing"),
         ("newer", f"states of version 9, this gateway has {VERSION}"),
         ("crash", "the other side has ended"),
-        ("hangs", "says nothing for 0.5 s"),
+        ("hangs", "sent nothing for 0.5 s"),
     ],
 )
 def test_a_broken_successor_is_ended_and_the_gateway_goes_on(
@@ -164,9 +164,9 @@ def test_a_broken_successor_is_ended_and_the_gateway_goes_on(
     patched = bench.folder / "patched.py"
     patched.write_text(
         f"import sys; sys.path.insert(0, {str(ROOT)!r})\n"
-        "from zbridge.app.handover import outgoing, successor\n"
+        "from zbridge.app.handover import outgoing, processes\n"
         f"outgoing.START_S, outgoing.TAKE_OVER_S = {1.0 if how == 'silent' else 20.0}, 0.5\n"
-        f"successor.COMMAND = [sys.executable, {str(broken)!r}]\n"
+        f"processes.COMMAND = [sys.executable, {str(broken)!r}]\n"
         "from zbridge.cli import main\n"
         "main()\n"
     )

@@ -23,9 +23,9 @@ from tests.access import LAB, OTHER
 from tests.e2e.conftest import Bench, Gateway, ask, device, until
 from tests.e2e.secure import FAR, GRACE_S, SecureBus, declared
 from tests.proofs import Holder, packed
-from zbridge.app.roles import Member, Roles
 from zbridge.bus.tls.files import folder_tls
 from zbridge.errors import BusError, LeaseLost, Malformed
+from zbridge.security.roles import Member, Roles
 
 ROLES = Roles(
     {

@@ -16,12 +16,12 @@ from tests.e2e.conftest import HOST, WAIT_S, Bench, Gateway, device, listener, u
 from tests.e2e.hq_programs import tcpudp_by_tcp
 from tests.e2e.secure import SecureBus
 from tests.ports import free_port
-from zbridge.app.roles import Member, Roles
 from zbridge.bus import BusSettings
 from zbridge.bus.tls.files import folder_tls
 from zbridge.cli.gateway_commands import restart
 from zbridge.client import Fleet
 from zbridge.errors import BusRefused, Malformed
+from zbridge.security.roles import Member, Roles
 
 ROLES = Roles({**LAB.names, "op2": Member("operator")})
 DENIED_S = 0.7

@@ -19,7 +19,7 @@ from tests.e2e.crossings import Case, Outcome, measure
 from tests.e2e.robots import MOVE, STOP, Robot, position
 from tests.e2e.steps import AFTER_GIVEN, AFTER_GO, FIRST_READ
 from tests.e2e.supervised import Supervised
-from zbridge.app.supervisor.runner import KEPT_CRASHES
+from zbridge.host.runner import RESUMED_CRASHES
 
 ROBOTS = 8
 
@@ -105,8 +105,8 @@ def test_eight_robots_of_which_one_crashes_and_one_gets_a_faulty_file(host: Host
     fleet, supervisor = host.bench.fleet, host.supervisor
     host.ready()
 
-    goes_on = r"r3: process \d+ goes on with its connections"
-    for count in range(1, KEPT_CRASHES + 1):
+    goes_on = r"r3: process \d+ continues with its connections"
+    for count in range(1, RESUMED_CRASHES + 1):
         os.kill(supervisor.gateway("r3"), signal.SIGKILL)
         until(lambda count=count: len(re.findall(goes_on, supervisor.log)) == count, 20, goes_on)  # type: ignore[misc]
     assert host.connections[3] == 1
@@ -209,7 +209,7 @@ def test_no_file_keeps_a_supervisor_from_starting_from_following_others_or_from_
         os.kill(supervisor.gateway("r0"), signal.SIGKILL)
         stop = until(lambda: robot.packets(STOP, killed), what="the stop")[0]
     assert stop.at - killed < 0.5
-    until(lambda: re.search(r"r0: process \d+ goes on with its connections", supervisor.log), 20, "the next process")
+    until(lambda: re.search(r"r0: process \d+ continues with its connections", supervisor.log), 20, "the next process")
     until(lambda: "large.toml" in supervisor.log, 20, "the fault of the large file")
     assert robot.connections == 1
     until(lambda: b"faulty files" in systemd.recv(1000), what="the status line")
@@ -258,11 +258,11 @@ def test_a_supervisor_goes_on_by_the_installed_code_and_driven_robots_notice_not
         os.kill(pids[1], signal.SIGKILL)
         until(lambda: robots[1].packets(STOP, killed), what="the stop over the duplicate")
         until(
-            lambda: re.search(r"r1: process \d+ goes on with its connections", supervisor.log), 20, "the next process"
+            lambda: re.search(r"r1: process \d+ continues with its connections", supervisor.log), 20, "the next process"
         )
         os.kill(pids[2], signal.SIGSTOP)
         until(lambda: "gave no sign of life" in supervisor.log, 20, "the one that hangs")
-        until(lambda: re.search(r"r2: (process \d+ goes on|next process in)", supervisor.log), 20, "the next process")
+        until(lambda: re.search(r"r2: (process \d+ continues|next process in)", supervisor.log), 20, "the next process")
     supervisor.gateway("r2", not_pid=pids[2])
     until(lambda: [bench.fleet.state(f"r{number}") for number in range(3)] == ["established"] * 3, 20, "all robots")
     assert host.connections[:2] == [1, 1]

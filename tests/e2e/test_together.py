@@ -15,10 +15,10 @@ from tests.e2e.conftest import HOST, WAIT_S, end, start
 from tests.e2e.secure import SecureBus
 from tests.e2e.test_secure_gateway import member
 from tests.simulated_robot import simulated
-from zbridge.app.roles import Member, Roles
 from zbridge.bus.tls.files import folder_tls
 from zbridge.client import Fleet
 from zbridge.protocol.plugin import find_protocol
+from zbridge.security.roles import Member, Roles
 
 ROBOTS = {"alf1": "alf", "tcp1": "tcpudp", "wc1": "wc2ec", "bad1": "wc2ec"}
 NAMES = {name: LAB.names[name] for name in ("v1", "op1", "main")}

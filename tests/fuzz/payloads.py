@@ -10,13 +10,13 @@ import msgspec
 
 from tests.fleet.test_payload import PAYLOADS
 from tests.fuzz.target import Target, comparable, require_same
-from zbridge.app.handover import messages as handover
-from zbridge.app.supervisor import messages as supervisor
+from zbridge.app.handover import channel as handover
 from zbridge.control.admission import is_stop
 from zbridge.control.latch import STOPS, Latches, LatchRecord, latch_of, read_stop
 from zbridge.errors import LinkError, Malformed, PayloadError, ProtocolError, Unsupported
 from zbridge.fleet import messages, payload, topics
 from zbridge.fleet.messages import Authorization, FleetMessage, Stop
+from zbridge.host import fd_channel as supervisor
 from zbridge.lease.proof import Verifier, read
 from zbridge.protocol.address import Address, parse_device_address
 from zbridge.protocol.samples import KeyedSample, SampleKind, read_sample, write_sample
@@ -207,8 +207,9 @@ def _claims() -> Iterator[bytes]:
 
 def _processes() -> Iterator[bytes]:
     said: list[Any] = [
-        handover.Hello(2, 1), handover.Given(2, {"a": 1}, 3, listeners=({"b": b"c"},), metrics=(1,)), handover.Up(),
-        handover.Failed("no"), supervisor.Beat(), supervisor.Opened(1, "robot"), supervisor.Kept(((1, 2),), 1, 9),
+        handover.Hello(2, 1), handover.HandoverState(2, {"a": 1}, 3, listeners=({"b": b"c"},), metrics=(1,)),
+        handover.Up(), handover.Failed("no"),
+        supervisor.Heartbeat(), supervisor.Opened(1, "robot"), supervisor.Deposited(((1, 2),), 1, 9),
         supervisor.Fork("r1.toml", "r1"), supervisor.Forked(7), supervisor.Ready(),
     ]  # fmt: skip
     yield from map(msgspec.msgpack.encode, said)

@@ -28,7 +28,7 @@ REACHED: dict[str, Callable[[str, str, tuple[Any, ...]], bool]] = {
     "released": lambda who, what, fields: what == "released",
 }
 """The states that a fault can wait for."""
-_SAID = ("Hello", "Given", "Up", "Go")
+_SAID = ("Hello", "HandoverState", "Up", "Go")
 HANDOVER: dict[str, Callable[[str, str, tuple[Any, ...]], bool]] = {
     f"{said} {what}": lambda who, noted, fields, what=what, said=said: (  # type: ignore[misc]
         noted == f"handover {what}" and fields[0] == said

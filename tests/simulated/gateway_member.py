@@ -20,7 +20,7 @@ from tests.simulated.handover import SimProcesses, Spawner, UnixEnd
 from tests.simulated.members import Member
 from tests.simulated.net import Network
 from tests.simulated.sockets import SimKernel
-from zbridge.app.config import Plan, plan
+from zbridge.app.config import GatewayPlan, plan
 from zbridge.app.gateway import Gateway
 from zbridge.app.runtime import Runtime
 from zbridge.errors import ZbridgeError
@@ -172,7 +172,7 @@ class GatewayMember(Member):
     def _runtime(self, life: Life) -> Runtime:
         process, rng = life.process, life.process.rng
 
-        async def join(plan: Plan, metrics: Metrics) -> Any:
+        async def join(plan: GatewayPlan, metrics: Metrics) -> Any:
             return SimBus(life.session, metrics)
 
         return Runtime(

@@ -10,8 +10,7 @@ from collections import deque
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from tests.simulated.engine import THREAD_S, Process
-from zbridge.app.handover.channel import Channel
-from zbridge.app.handover.messages import Go, Message
+from zbridge.app.handover.channel import Go, HandoverChannel, Message
 from zbridge.app.handover.processes import Processes
 from zbridge.errors import HandoverError
 from zbridge.transport import Parcel
@@ -23,7 +22,7 @@ M = TypeVar("M")
 
 
 class UnixEnd:
-    """One end of a Unix stream socket, as far as :class:`Channel` uses it."""
+    """One end of a Unix stream socket, as far as :class:`HandoverChannel` uses it."""
 
     def __init__(self, process: Process) -> None:
         self.process = process
@@ -136,7 +135,7 @@ class UnixEnd:
             return
 
 
-class SimChannel(Channel):
+class SimChannel(HandoverChannel):
     """The product's channel, whose threads never wait: the event loop does."""
 
     _socket: UnixEnd  # type: ignore[assignment]
@@ -197,11 +196,11 @@ class SimProcesses(Processes):
     def own_pid(self) -> int:
         return self._process.pid
 
-    def pair(self) -> tuple[Channel, Any]:
+    def pair(self) -> tuple[HandoverChannel, Any]:
         near, far = UnixEnd.pair(self._process)
         return SimChannel(near), far  # type: ignore[arg-type]
 
-    def channel(self, end: Any) -> Channel:
+    def channel(self, end: Any) -> HandoverChannel:
         return SimChannel(end)
 
     def process(self, pid: int) -> Any:

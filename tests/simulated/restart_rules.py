@@ -97,7 +97,7 @@ class RestartRules:
             }
             ends = [end for end in robot.ends if end.peer.address[0] == host and self._is_settled(end)]
             self._hello[name] = (ends, programs)
-        elif part == "" and (what, said) == ("unsent", "Given"):
+        elif part == "" and (what, said) == ("unsent", "HandoverState"):
             self._given[name] = True
             host = self.checker.gateways[name].host.name
             if self._moves.get(name) and any(end.peer.address[0] == host for end in self.simulation.robot.ends):

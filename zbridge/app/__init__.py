@@ -1,12 +1,11 @@
-"""One process: its configuration, the gateway made of it, templates of configurations, counters for Prometheus.
+"""One gateway process: its configuration, the gateway made of it, templates, counters for Prometheus, restarts.
 
-Puts the rooms below together. Knows no protocol (they are found by their entry points) and no terminal; only
-:mod:`zbridge.cli` imports it.
+Puts the rooms below together. Knows no protocol (entry points find them), no terminal and no other gateway of its host.
 """
 
-from zbridge.app.config import Plan, load, plan
+from zbridge.app.config import GatewayPlan, load, plan
 from zbridge.app.gateway import Gateway
 from zbridge.app.tasks import until_signal
 from zbridge.app.templates import listener_template, robot_template
 
-__all__ = ["Gateway", "Plan", "listener_template", "load", "plan", "robot_template", "until_signal"]
+__all__ = ["Gateway", "GatewayPlan", "listener_template", "load", "plan", "robot_template", "until_signal"]

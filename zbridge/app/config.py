@@ -17,7 +17,6 @@ from typing import Any
 
 import msgspec
 
-from zbridge.app.toml import convert, parse_toml, read_file
 from zbridge.bus import BusSettings
 from zbridge.bus.tls.files import TLS_VARIABLE, folder_settings, tls_beside
 from zbridge.camera import CameraPlan, CameraSettings, plan_camera
@@ -25,10 +24,11 @@ from zbridge.control.settings import ControlSettings
 from zbridge.errors import ConfigError, LinkError
 from zbridge.fleet.topics import is_name
 from zbridge.hq import HqSettings, ListenerPlan
-from zbridge.protocol.address import Address, DeviceAddress
+from zbridge.protocol.address import Address
 from zbridge.protocol.networks import parse_networks
-from zbridge.protocol.plugin import Protocol, find_protocol
+from zbridge.protocol.plugin import find_protocol
 from zbridge.robot.settings import DevicePlan, DeviceSettings
+from zbridge.toml import convert, parse_toml, prefixed, read_file
 from zbridge.transport import server_context
 
 _VARIABLE = re.compile(r"\$\{(\w+)\}")
@@ -59,7 +59,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     camera: CameraSettings | None = None
 
 
-class Plan(msgspec.Struct, frozen=True):
+class GatewayPlan(msgspec.Struct, frozen=True):
     """A configuration with the protocols, options and addresses that it names: what a gateway starts from."""
 
     config: Config
@@ -84,7 +84,7 @@ def load(
     *,
     tls: Path | None = None,
     content: bytes | None = None,
-) -> Plan:
+) -> GatewayPlan:
     """Read and check a configuration file; raise ConfigError, which names the file as well.
 
     tls: a folder as ``zbridge certs bundle`` makes it, for a file without ``bus.tls``; so does ``ZBRIDGE_TLS``. Paths
@@ -92,10 +92,9 @@ def load(
     """
     raw = parse_toml(path, read_file(path, waits=True) if content is None else content)
     try:
-        planned = plan(raw, environment)
-        bus = _secured(planned.config.bus, path.absolute().parent, tls, environment.get(TLS_VARIABLE))
-    except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from error
+        with prefixed(f"{path}: "):
+            planned = plan(raw, environment)
+            bus = _secured(planned.config.bus, path.absolute().parent, tls, environment.get(TLS_VARIABLE))
     except RecursionError as error:
         raise ConfigError(f"{path}: nested too deeply") from error
     return msgspec.structs.replace(planned, config=msgspec.structs.replace(planned.config, bus=bus))
@@ -114,7 +113,7 @@ def _secured(bus: BusSettings, beside: Path, tls: Path | None, variable: str | N
     return msgspec.structs.replace(bus, connect=given.connect, tls=given.tls)
 
 
-def plan(raw: dict[str, Any], environment: Mapping[str, str] = os.environ) -> Plan:
+def plan(raw: dict[str, Any], environment: Mapping[str, str] = os.environ) -> GatewayPlan:
     """Check a configuration given as a dict; raise ConfigError."""
     raw = _substituted(raw, environment, "")
     config = convert(raw, Config, "")
@@ -137,13 +136,15 @@ def plan(raw: dict[str, Any], environment: Mapping[str, str] = os.environ) -> Pl
     camera = plan_camera(config.camera) if config.camera is not None else None
     if camera is not None and device is None:
         raise ConfigError("camera: expected only where there is a table device")
-    return Plan(config, device, listeners, metrics, camera)
+    return GatewayPlan(config, device, listeners, metrics, camera)
 
 
 def _device(settings: DeviceSettings) -> DevicePlan:
-    protocol = _protocol("device.", settings.protocol)
+    with prefixed("device."):
+        protocol = find_protocol(settings.protocol)
     options = convert(settings.options, protocol.options, "device.options.")
-    addresses = tuple(_device_address("device.connect", protocol, text) for text in settings.connect)
+    with prefixed("device.connect = ", LinkError):
+        addresses = tuple(map(protocol.device_address, settings.connect))
     if len(addresses) > protocol.links:
         raise ConfigError(
             f"device.connect = {list(settings.connect)}: a {protocol.name} robot has at most {protocol.links} link"
@@ -153,14 +154,16 @@ def _device(settings: DeviceSettings) -> DevicePlan:
 
 
 def _listener(settings: HqSettings, key: str) -> ListenerPlan:
-    protocol = _protocol(f"{key}.", settings.protocol)
+    with prefixed(f"{key}."):
+        protocol = find_protocol(settings.protocol)
     if protocol.hq is None:
         raise ConfigError(f"{key}.protocol = {settings.protocol!r}: serves no HQ programs")
     if settings.name is not None and not is_name(settings.name):
         raise ConfigError(f"{key}.name = {settings.name!r}: expected letters, digits, '_', '.' and '-' only")
     options = convert(settings.options, protocol.hq_options, f"{key}.options.")
     allow = parse_networks(f"{key}.allow", settings.allow)
-    address = _listener_address(f"{key}.listen", settings.listen)
+    with prefixed(f"{key}.listen = ", LinkError):
+        address = Address.parse_listener(settings.listen)
     return ListenerPlan(protocol, options, address, settings, allow, _listener_tls(key, settings, address))
 
 
@@ -177,31 +180,8 @@ def _listener_tls(key: str, settings: HqSettings, address: Address) -> SSLContex
         return None
     if not address.tls:
         raise ConfigError(f"{key}.listen = {settings.listen!r}: expected tls://host:port, for there is a table tls")
-    try:
+    with prefixed(f"{key}.tls: ", LinkError):
         return server_context(tls.certificate, tls.key, tls.ca)
-    except LinkError as error:
-        raise ConfigError(f"{key}.tls: {error}") from error
-
-
-def _protocol(prefix: str, name: str) -> Protocol:
-    try:
-        return find_protocol(name)
-    except ConfigError as error:
-        raise ConfigError(f"{prefix}{error}") from error
-
-
-def _listener_address(key: str, text: str) -> Address:
-    try:
-        return Address.parse_listener(text)
-    except LinkError as error:
-        raise ConfigError(f"{key} = {error}") from error
-
-
-def _device_address(key: str, protocol: Protocol, text: str) -> DeviceAddress:
-    try:
-        return protocol.device_address(text)
-    except LinkError as error:
-        raise ConfigError(f"{key} = {error}") from error
 
 
 def _metrics_address(text: str) -> Address:

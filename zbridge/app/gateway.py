@@ -18,12 +18,11 @@ from typing import Any
 
 import msgspec
 
-from zbridge.app.audit import open_audit
-from zbridge.app.config import Plan
+from zbridge.app.config import GatewayPlan
 from zbridge.app.handover import ClaimPart, Incoming, Restarts, Successor
 from zbridge.app.joining import SessionUseless, watch_certificate, watch_session
 from zbridge.app.prometheus import serve_metrics
-from zbridge.app.runtime import RUNTIME, Runtime
+from zbridge.app.runtime import RUNTIME, Runtime, open_audit
 from zbridge.app.serving import SERVED_ELSEWHERE, Begin, Serving
 from zbridge.app.tasks import together, until
 from zbridge.bus import Bus, Handle, IncomingQuery
@@ -71,14 +70,14 @@ class Neighbourhood(msgspec.Struct, frozen=True):
 class Gateway:
     """A gateway of one robot: its device side, its listeners, or both, as the plan says.
 
-    metrics, sessions, conditions: of this gateway, shared by all parts. observer: a supervisor, told of the robot's
+    metrics, sessions, conditions: of this gateway, shared by all parts. observer: a supervisor, notified of the robot's
     links. predecessor: the channel to a gateway that hands everything over. successor: starts a process to which this
     one can be handed over. runtime: the machine below.
     """
 
     def __init__(
         self,
-        plan: Plan,
+        plan: GatewayPlan,
         metrics: Metrics | None = None,
         *,
         observer: Observer | None = None,
@@ -155,7 +154,7 @@ class Gateway:
             stack.callback(bus.watch_connected(self._on_bus).close)
             self.restarts.bus, robot = bus, RobotSubscription(bus, self._keys, self.metrics)
             listeners = self._listeners(bus, robot)
-            taken = self._incoming.taken if self._incoming is not None else None
+            taken = self._incoming.part_taken_over if self._incoming is not None else None
             work: list[Coroutine[Any, Any, None]] = [listener.run(taken) for listener in listeners]
             self.restarts.listeners = [listener.handover for listener in listeners]
             certificate = own_certificate(self._plan.config.bus.tls)
@@ -179,7 +178,7 @@ class Gateway:
         given = []
         if self._incoming is not None:
             await self._incoming.begun.wait()
-            given = [self._runtime.kernel.adopt(self._incoming.parcel.take(n)) for n in self._incoming.given.metrics]
+            given = [self._runtime.kernel.adopt(self._incoming.parcel.take(n)) for n in self._incoming.state.metrics]
         async with serve_metrics(address, self.metrics, self.missing, given) as self.restarts.metrics_sockets:
             await asyncio.Event().wait()
 
@@ -188,8 +187,8 @@ class Gateway:
         names = listener_names(plans, self._own, bus.zid)
         self._process = process_name(names, self._own, bus.zid) if names else "gateway"
         given: list[tuple[Exported, Parcel] | None] = [None] * len(plans)
-        if incoming is not None and incoming.given.listeners:  # a gateway that died leaves none: they are bound anew
-            given = [(each, incoming.parcel) for each in incoming.given.listeners]
+        if incoming is not None and incoming.state.listeners:  # a gateway that died leaves none: they are bound anew
+            given = [(each, incoming.parcel) for each in incoming.state.listeners]
         return [
             Listener(
                 plan,
@@ -220,7 +219,7 @@ class Gateway:
     async def _robot(self, bus: Bus, audit: Audit, plan: DevicePlan) -> None:
         """Serve the robot whenever no other gateway does."""
         self.restarts.latches = store = LatchStore(self._keys, self.conditions, self._runtime.folder)
-        store.load()  # what it says is told to the gateway that serves the robot
+        store.load()  # the gateway that serves the robot is sent its contents
         clock, chance = self._runtime.clock, self._runtime.chance
         ownership = Ownership(
             bus, self._keys, clock, mirror=store.mirror, autonomous=lambda: store.autonomous, chance=chance
@@ -230,19 +229,19 @@ class Gateway:
         try:
             bus.gather(self._keys.key("@rpc/**"))
             if incoming is not None:
-                given = incoming.given
+                given = incoming.state
                 if given.device is not None and given.claim:
                     ownership.inherit(given.claim)
                     device = self._make_device(bus, audit, plan, store)
                     device.take_over(given.device, incoming.parcel, given.partials)
 
                     async def begin(incoming: Incoming = incoming, device: Device = device) -> None:
-                        await incoming.taken()
+                        await incoming.part_taken_over()
                         ownership.begin()
                         device.restore_latches(store.load())  # one that came last is only in the file
 
                     await self._serve(bus, ownership, device, store, begin)
-                elif not incoming.given.listeners:
+                elif not incoming.state.listeners:
                     await incoming.finish()
                 await incoming.begun.wait()
             while True:

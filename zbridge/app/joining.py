@@ -17,7 +17,7 @@ import random
 from collections.abc import Awaitable, Callable
 from datetime import datetime
 
-from zbridge.app.config import Plan
+from zbridge.app.config import GatewayPlan
 from zbridge.bus import OPEN_S, Bus, open_bus
 from zbridge.bus.tls.certificate import Certificate
 from zbridge.bus.tls.files import ends_soon, utc_now
@@ -37,12 +37,12 @@ EXPLAIN_FROM, EXPLAIN_EVERY = 2, 10
 letting them in."""
 RARELY_S = 60.0
 """Longest time between two attempts after refusals: each costs the router, and with it everybody, 0.1 s."""
-LOOK_S = 3600.0
-"""Seconds between looks at the certificate's end."""
-SAY_S = 86_400.0
+CHECK_S = 3600.0
+"""Seconds between checks of the certificate's end."""
+LOG_S = 86_400.0
 """Seconds between log lines about the certificate's end."""
 ENDED_S = 5.0
-"""Seconds between looks after the certificate's end: at the next one without a bus the gateway leaves."""
+"""Seconds between checks after the certificate's end: at the next one without a bus the gateway leaves."""
 STUCK_S = 15.0
 """Seconds without a connection after which a second session is tried, every time; Zenoh itself tries every 4 s."""
 RECONNECTS_S = 10.0
@@ -86,7 +86,7 @@ class Pauses:
         return longest * (0.5 + 0.5 * self._chance())
 
 
-async def join_bus(plan: Plan, metrics: Metrics) -> Bus:
+async def join_bus(plan: GatewayPlan, metrics: Metrics) -> Bus:
     """Open the bus; try again until that succeeds, rarely where the router refuses.
 
     A thousand others may wait for the same router: attempts are given more time, and come at other times than theirs.
@@ -111,7 +111,7 @@ async def join_bus(plan: Plan, metrics: Metrics) -> Bus:
     raise AssertionError("it tries for ever")
 
 
-async def can_connect(plan: Plan) -> bool:
+async def can_connect(plan: GatewayPlan) -> bool:
     """Whether a new session connects to the bus; it is closed again."""
     try:
         bus = await open_bus(plan.config.bus, Metrics(), within_s=OPEN_S, explain=False)
@@ -121,7 +121,7 @@ async def can_connect(plan: Plan) -> bool:
     return True
 
 
-async def watch_session(plan: Plan, bus: Bus, can_connect: Callable[[Plan], Awaitable[bool]]) -> None:
+async def watch_session(plan: GatewayPlan, bus: Bus, can_connect: Callable[[GatewayPlan], Awaitable[bool]]) -> None:
     """Raise SessionUseless where a client's session does not connect again, and a new one does."""
     changed, here = asyncio.Event(), False
 
@@ -155,7 +155,7 @@ async def watch_certificate(
     Raises CertificateEnded when it has ended and there is no connection to the bus.
     """
     loop = asyncio.get_running_loop()
-    said, said_at, here = None, 0.0, True
+    logged, logged_at, here = None, 0.0, True
 
     def connected(is_here: bool) -> None:
         nonlocal here
@@ -165,10 +165,10 @@ async def watch_certificate(
     while True:
         text = ends_soon(certificate, now())
         conditions.set(_CERTIFICATE, text)
-        if text is not None and (text != said or loop.time() - said_at >= SAY_S):
-            said, said_at = text, loop.time()
+        if text is not None and (text != logged or loop.time() - logged_at >= LOG_S):
+            logged, logged_at = text, loop.time()
             log.warning("%s", text)
         left_s = (certificate.ends - now()).total_seconds()
         if left_s <= 0 and not here:
             raise CertificateEnded(f"{text}; the bus is left")
-        await asyncio.sleep(min(max(left_s, 0.0) + ENDED_S, LOOK_S))
+        await asyncio.sleep(min(max(left_s, 0.0) + ENDED_S, CHECK_S))

@@ -36,18 +36,18 @@ Clients = dict[asyncio.Task[None], socket.socket]
 
 @contextlib.asynccontextmanager
 async def serve_metrics(
-    address: Address, metrics: Metrics, missing: Missing = lambda: (), given: Sequence[socket.socket] = ()
+    address: Address, metrics: Metrics, missing: Missing = lambda: (), adopted: Sequence[socket.socket] = ()
 ) -> AsyncIterator[list[socket.socket]]:
     """Serve ``GET /metrics``, ``/healthz`` and ``/readyz`` while the context lasts.
 
-    Gives the sockets at which it listens; ``given``: those of another process, in place of new ones. An address in use
-    is logged as an error and otherwise ignored.
+    Gives the sockets at which it listens; ``adopted``: those of another process, in place of new ones. An address in
+    use is logged as an error and otherwise ignored.
 
     Connections are accepted one by one, PAUSE_S apart: a server of asyncio accepts all at once and starves the rest of
     the process meanwhile. Of more than CLIENTS the oldest is closed, so that whoever sends a request is answered.
     """
     try:
-        sockets = list(given) or await waiting_sockets(address)
+        sockets = list(adopted) or await waiting_sockets(address)
     except OSError as error:
         log.error("metrics endpoint %s: %s", address, error.strerror or error)
         yield []

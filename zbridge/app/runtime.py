@@ -1,23 +1,26 @@
-"""What a gateway takes from its machine: clocks, randomness, sockets, processes, a folder and the bus.
-
-A simulation injects its own.
+"""What a gateway takes from its machine: clocks, randomness, sockets, processes, a folder, the bus, and the file of its
+audit log. A simulation injects its own :class:`Runtime`.
 """
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import logging
 import random
 import secrets
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 
 import msgspec
 
-from zbridge.app.config import Plan
+from zbridge.app.config import GatewayPlan
 from zbridge.app.handover.processes import PROCESSES, Processes
 from zbridge.app.joining import can_connect, join_bus
 from zbridge.bus import Bus
-from zbridge.control.context import suspended_s
+from zbridge.control.audit_log import Audit, AuditFile
+from zbridge.control.context import Conditions, suspended_s
 from zbridge.lease.lease_holder import raw_ms
 from zbridge.metrics import Metrics
 from zbridge.transport.kernel import KERNEL, Kernel
@@ -41,9 +44,38 @@ class Runtime(msgspec.Struct, frozen=True):
     kernel: Kernel = KERNEL
     folder: Path | None = None
     processes: Processes = PROCESSES
-    join: Callable[[Plan, Metrics], Awaitable[Bus]] = join_bus
-    can_connect: Callable[[Plan], Awaitable[bool]] = can_connect
+    join: Callable[[GatewayPlan, Metrics], Awaitable[Bus]] = join_bus
+    can_connect: Callable[[GatewayPlan], Awaitable[bool]] = can_connect
 
 
 RUNTIME = Runtime()
 """This machine."""
+
+
+@contextlib.contextmanager
+def open_audit(plan: GatewayPlan, metrics: Metrics, conditions: Conditions) -> Iterator[Audit]:
+    """Open the audit log: the file that the configuration names, else the process's log at DEBUG."""
+    control, name = plan.config.control, plan.config.robot.name
+    if control.audit is None or plan.device is None:
+        yield Audit(name, logging.getLogger("zbridge.control.audit_log").debug)
+        return
+    loop = asyncio.get_running_loop()
+
+    def report(text: str | None) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop has ended
+            loop.call_soon_threadsafe(conditions.set, "audit", text)
+
+    file = AuditFile(
+        Path(control.audit),
+        metrics,
+        file_bytes=control.audit_bytes,
+        files=control.audit_files,
+        days=control.audit_days,
+        tell=report,
+    )
+    audit = Audit(name, file.write)
+    try:
+        yield audit
+    finally:
+        audit.close()
+        file.close()

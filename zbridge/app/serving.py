@@ -24,11 +24,11 @@ from zbridge.robot.ownership import Claim, Ownership, Standing
 
 log = logging.getLogger("zbridge.app.gateway")
 
-TELL_S = 60.0
+LOG_S = 60.0
 """Seconds between two log lines about other gateways that serve the same robot."""
 SERVED_ELSEWHERE = "served by another gateway"
 SECOND_CONNECTION = "a second connection is open; ending that gateway makes the robot deaf"
-_NAMED = 3
+_LISTED = 3
 """Other gateways that a log line names."""
 _RIVALS = "rivals"
 
@@ -64,7 +64,7 @@ class Serving:
         self._shown: list[Handle] = []
         self._filming: asyncio.Task[None] | None = None
         self._camera_failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._told_at = -math.inf
+        self._logged_at = -math.inf
         self._owners_record = LatchRecord()
 
     def __repr__(self) -> str:
@@ -153,15 +153,15 @@ class Serving:
             await asyncio.gather(filming, return_exceptions=True)
 
     def _report(self, claims: Mapping[str, Claim]) -> None:
-        """Show other gateways: on ``status`` always, on ``control`` and in the log every TELL_S."""
+        """Show other gateways: on ``status`` always, on ``control`` and in the log every LOG_S."""
         zids = [zid for zid, claim in claims.items() if not claim.yielded]
-        more = f" and {len(zids) - _NAMED} more" if len(zids) > _NAMED else ""
-        text = f"another gateway serves this robot too: {', '.join(zids[:_NAMED])}{more}"
+        more = f" and {len(zids) - _LISTED} more" if len(zids) > _LISTED else ""
+        text = f"another gateway serves this robot too: {', '.join(zids[:_LISTED])}{more}"
         if claims and not zids:
             text = SECOND_CONNECTION
         self._conditions.set(_RIVALS, text if claims else None)
-        if claims and self._clock() - self._told_at >= TELL_S:
-            self._told_at = self._clock()
+        if claims and self._clock() - self._logged_at >= LOG_S:
+            self._logged_at = self._clock()
             log.error("%s: %s", self._robot, text)
-            for zid in zids[:_NAMED]:
+            for zid in zids[:_LISTED]:
                 self._device.refuse("claim", Held("this gateway serves the robot"), zid)

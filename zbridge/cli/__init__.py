@@ -23,19 +23,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from zbridge.app import Gateway, load, until_signal
-from zbridge.app.addresses import hold_addresses
 from zbridge.app.handover import Spawn
-from zbridge.app.host import HostSettings, require_different_robots, require_one_bus
-from zbridge.app.member import check_member
-from zbridge.app.together import Together
-from zbridge.app.toml import read_file
 from zbridge.bus.tls.files import TLS_VARIABLE
 from zbridge.errors import ConfigError, ZbridgeError
 from zbridge.fleet.printable import shown
+from zbridge.host.addresses import hold_addresses
+from zbridge.host.settings import HostSettings, require_different_robots, require_one_bus
+from zbridge.host.together import Together
+from zbridge.security.member import check_member
+from zbridge.toml import read_file
 
 if TYPE_CHECKING:  # loaded where there is a supervisor only
-    from zbridge.app.config import Plan
-    from zbridge.app.supervisor.child import Reporter
+    from zbridge.app.config import GatewayPlan
+    from zbridge.host.child import Reporter
 
 
 def main() -> None:
@@ -102,7 +102,7 @@ def run_gateway(
 
     async def work() -> None:
         if reporter is not None:
-            reporter.keep = gateway.restarts.keep
+            reporter.describe = gateway.restarts.deposit
             reporter.begin()
         await until_signal(serve(), {signal.SIGUSR2: gateway.restarts.restart})
 
@@ -111,11 +111,11 @@ def run_gateway(
     except ConfigError as error:
         raise ConfigError(f"{file}: {error}") from error
     if gateway.restarts.gone.is_set() and isinstance(successor, Spawn):
-        successor.tell_systemd()
+        successor.notify_systemd()
     _exit(left=gateway.left)
 
 
-def _check(plan: Plan, file: Path, only: str | None) -> None:
+def _check(plan: GatewayPlan, file: Path, only: str | None) -> None:
     parts = {"device": plan.device} if plan.device else {f"hq[{n}]": part for n, part in enumerate(plan.listeners)}
     for key, part in parts.items():
         if only is not None and part.protocol.name != only:

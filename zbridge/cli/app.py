@@ -10,9 +10,6 @@ from typing import Annotated
 import typer
 
 from zbridge.app import listener_template, load, robot_template, until_signal
-from zbridge.app.addresses import require_free
-from zbridge.app.host import HostSettings, load_host, robot_files
-from zbridge.app.member import check_member, not_checked
 from zbridge.app.tasks import together
 from zbridge.bus.tls.files import ends_soon, out_of_date, utc_now
 from zbridge.cli import (
@@ -30,9 +27,12 @@ from zbridge.cli.options import Connect, FileTls, Realm, TlsFolder, check_name
 from zbridge.client import bus_settings
 from zbridge.errors import ConfigError
 from zbridge.fleet.printable import shown
+from zbridge.host.addresses import require_free
+from zbridge.host.settings import HostSettings, load_host, robot_files
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.protocol.plugin import HqSimulation, Protocol, Simulation, find_protocol, protocol_names
+from zbridge.security.member import check_member, not_checked
 
 app = typer.Typer(
     help=__doc__,

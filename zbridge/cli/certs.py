@@ -12,14 +12,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from zbridge.app.roles import OF_ROBOTS, ROLES, Member, load_roles
 from zbridge.errors import ConfigError
 from zbridge.fleet.printable import as_json, shown
+from zbridge.security.roles import OF_ROBOTS, ROLES, Member, load_roles
 
 if TYPE_CHECKING:
-    from zbridge.app.certs.authority import Issued
-    from zbridge.app.certs.files import Folder
-    from zbridge.app.certs.listing import Entry
+    from zbridge.security.certs.authority import Issued, ListedCertificate
+    from zbridge.security.certs.files import Folder
 
 app = typer.Typer(
     help="Make the certificates of a secure bus: an authority, and one certificate for each name.",
@@ -49,7 +48,7 @@ def init(
 ) -> None:
     """Make an authority, and an empty roles.toml."""
     folder = opened(place or directory)
-    from zbridge.app.certs import authority
+    from zbridge.security.certs import authority
 
     made = authority.init(folder, now(), force=force)
     say(f"{folder.ca}: {made.common_name}, expires {made.expires:%Y-%m-%d}, {made.fingerprint}")
@@ -77,15 +76,15 @@ def issue(
 ) -> None:
     """Make the key and the certificate of a name, and write the name into roles.toml."""
     folder = opened(directory)
-    from zbridge.app.certs.authority import Request
-    from zbridge.app.certs.authority import issue as make
+    from zbridge.security.certs.authority import CertificateRequest
+    from zbridge.security.certs.authority import issue as make
 
     if role not in ROLES:
         raise ConfigError(f"--role {role!r}: expected one of {', '.join(ROLES)}")
     if listeners and role != "gateway":
         raise ConfigError(f"--listeners: a gateway's; the role {role} has none")
     member = Member(role, tuple(robot or ()), listeners)
-    issued = make(folder, Request(name, member, tuple(host or ()), days), now(), force=force)
+    issued = make(folder, CertificateRequest(name, member, tuple(host or ()), days), now(), force=force)
     say_issued(folder, name, issued)
     if issued.replaced_until is not None:
         say(
@@ -106,7 +105,7 @@ def renew(
 ) -> None:
     """Replace the certificate of a name by a new one for the same key, with the same hosts."""
     folder = opened(directory)
-    from zbridge.app.certs import authority
+    from zbridge.security.certs import authority
 
     if bool(names) == every:
         raise ConfigError("name one NAME or more, or give --all")
@@ -122,9 +121,9 @@ def list_names(
 ) -> None:
     """List the names: role, robots, hosts, expiry, fingerprint, and what is wrong."""
     folder = opened(directory)
-    from zbridge.app.certs import listing
+    from zbridge.security.certs import authority
 
-    entries = listing.list_names(folder, now())
+    entries = authority.list_names(folder, now())
     if json:
         for entry in entries:
             say(as_json(_fields(entry)))
@@ -136,7 +135,7 @@ def list_names(
 def revoke(name: Name, directory: Directory = Path("certs")) -> None:
     """Take a name out of roles.toml for good."""
     folder = opened(directory)
-    from zbridge.app.certs import authority
+    from zbridge.security.certs import authority
 
     gone = authority.revoke(folder, name)
     say(f"{gone.common_name} is revoked. {name} is never issued again.")
@@ -170,8 +169,8 @@ def bundle(
 ) -> None:
     """Pack a name for another machine: ca.pem, certificate.pem, key.pem, and bus.toml (a router: roles.toml)."""
     folder = opened(directory)
-    from zbridge.app.certs.bundle import Packing
-    from zbridge.app.certs.bundle import bundle as pack
+    from zbridge.security.certs.bundle import Packing
+    from zbridge.security.certs.bundle import bundle as pack
 
     for path in pack(folder, name, Packing(output, tuple(connect or ()), at), now(), force=force):
         say(path)
@@ -181,7 +180,7 @@ def opened(directory: Path) -> Folder:
     """Return the folder of the authority; raise ConfigError where the package ``cryptography`` is missing."""
     if importlib.util.find_spec("cryptography") is None:
         raise ConfigError("zbridge certs needs the package cryptography: pip install 'zbridge[certs]'")
-    from zbridge.app.certs.files import Folder
+    from zbridge.security.certs.files import Folder
 
     return Folder(directory)
 
@@ -201,7 +200,7 @@ def say_issued(folder: Folder, name: str, issued: Issued) -> None:
     say(f"{folder.of(name).folder}: {issued.common_name}, expires {issued.expires:%Y-%m-%d}, {issued.fingerprint}")
 
 
-def _fields(entry: Entry) -> dict[str, object]:
+def _fields(entry: ListedCertificate) -> dict[str, object]:
     return {
         "name": entry.name,
         "role": entry.role,
@@ -213,7 +212,7 @@ def _fields(entry: Entry) -> dict[str, object]:
     }
 
 
-def _print_table(entries: list[Entry]) -> None:
+def _print_table(entries: list[ListedCertificate]) -> None:
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text

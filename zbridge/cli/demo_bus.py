@@ -20,12 +20,12 @@ from typing import IO
 
 import msgspec
 
-from zbridge.app.roles import Member
 from zbridge.bus import Bus, open_bus
 from zbridge.bus.tls.files import folder_settings
 from zbridge.client import Fleet
 from zbridge.errors import BusError, ConfigError
 from zbridge.metrics import Metrics
+from zbridge.security.roles import Member
 
 END_S = 3.0
 """Longest time processes are given to end by themselves."""
@@ -128,9 +128,9 @@ def make_members(folder: Path, endpoint: str, gateways: dict[str, str]) -> Path:
     """
     if importlib.util.find_spec("cryptography") is None:
         raise ConfigError("zbridge demo --secure needs the package cryptography: pip install 'zbridge[certs]'")
-    from zbridge.app.certs import authority
-    from zbridge.app.certs.bundle import Packing, bundle
-    from zbridge.app.certs.files import Folder
+    from zbridge.security.certs import authority
+    from zbridge.security.certs.bundle import Packing, bundle
+    from zbridge.security.certs.files import Folder
 
     members = {
         _ROUTER: Member("router"),
@@ -143,7 +143,7 @@ def make_members(folder: Path, endpoint: str, gateways: dict[str, str]) -> Path:
     authority.init(made, now)
     for name, member in members.items():
         hosts = ("127.0.0.1",) if member.role == "router" else ()
-        authority.issue(made, authority.Request(name, member, hosts, DAYS), now)
+        authority.issue(made, authority.CertificateRequest(name, member, hosts, DAYS), now)
     for name in members:
         bundle(made, name, Packing(folder / name, (endpoint,)), now)
     return folder / _ROUTER / "roles.toml"

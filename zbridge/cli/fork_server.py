@@ -1,20 +1,20 @@
-"""``python -m zbridge.cli.fork_server FD``: the fork server of ``zbridge run DIR``. FD: its end of the post."""
+"""``python -m zbridge.cli.fork_server FD``: the fork server of ``zbridge run DIR``. FD: its end of the channel."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
 
-from zbridge.app.supervisor.child import Reporter
-from zbridge.app.supervisor.fork_server import Birth, serve
-from zbridge.app.supervisor.post import Post
 from zbridge.cli import give_up, run_gateway, set_up_log
 from zbridge.errors import ConfigError, ZbridgeError
+from zbridge.host.child import Reporter
+from zbridge.host.fd_channel import FdChannel
+from zbridge.host.fork_server import Birth, serve
 
 
 def main() -> None:
     """Serve the supervisor that started this process."""
-    serve(Post.inherited(int(sys.argv[1])), run)
+    serve(FdChannel.inherited(int(sys.argv[1])), run)
 
 
 def run(birth: Birth) -> int:
@@ -27,7 +27,7 @@ def run(birth: Birth) -> int:
             content=birth.read(),
             verbose=request.verbose,
             take_over=birth.take_over if birth.take_over >= 0 else None,
-            reporter=Reporter(Post.inherited(birth.post), hands_over=True),
+            reporter=Reporter(FdChannel.inherited(birth.channel), hands_over=True),
         )
     except ZbridgeError as error:
         try:

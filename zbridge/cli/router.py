@@ -9,14 +9,13 @@ from pathlib import Path
 import msgspec
 
 from zbridge.app import until_signal
-from zbridge.app.router import Router, ZenohWarnings
-from zbridge.app.router_firewall import nftables
-from zbridge.app.router_settings import RouterSettings, load_router, nested, plan_router, zenoh_values
-from zbridge.app.toml import convert
 from zbridge.bus import hear_zenoh
 from zbridge.bus.tls.files import folder_tls
 from zbridge.cli import run_loop
 from zbridge.errors import ConfigError
+from zbridge.security.router import Router, ZenohWarnings
+from zbridge.security.router_settings import RouterSettings, load_router, nested, nftables, plan_router, zenoh_values
+from zbridge.toml import convert
 
 RUNTIME = "(rx: (worker_threads: 2), acc: (worker_threads: 1))"
 """Threads of Zenoh's in a router: who knocks with garbage keeps the thread busy that accepts, not those that route."""

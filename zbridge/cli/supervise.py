@@ -8,12 +8,12 @@ import os
 from pathlib import Path
 
 from zbridge.app import until_signal
-from zbridge.app.host import HostSettings, load_host
-from zbridge.app.supervisor.forks import fork_server_command, module_command
-from zbridge.app.supervisor.state import restore
-from zbridge.app.supervisor.supervisor import Supervisor
 from zbridge.cli import set_up_log
 from zbridge.errors import ConfigError
+from zbridge.host.fork_client import fork_server_command, module_command
+from zbridge.host.replacement import restore
+from zbridge.host.settings import HostSettings, load_host
+from zbridge.host.supervisor import Supervisor
 
 
 def supervise(paths: tuple[Path, ...], *, watch: bool, verbose: bool) -> None:

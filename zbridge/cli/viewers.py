@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from zbridge.app import until_signal
-from zbridge.app.toml import convert, read_toml
 from zbridge.bus import BusSettings
 from zbridge.bus.tls.member import own_name, own_role
 from zbridge.cli import run_loop
 from zbridge.errors import ConfigError
 from zbridge.metrics import Metrics
+from zbridge.toml import convert, read_toml
 
 if TYPE_CHECKING:
     from zbridge.views.foxglove.server import ViewerServer

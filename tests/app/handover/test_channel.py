@@ -11,8 +11,7 @@ from collections.abc import Iterator
 import pytest
 
 from zbridge.app.handover import channel as channels
-from zbridge.app.handover.channel import Channel, EndError
-from zbridge.app.handover.messages import VERSION, Failed, Given, Go, Hello
+from zbridge.app.handover.channel import VERSION, EndError, Failed, Go, HandoverChannel, HandoverState, Hello
 from zbridge.errors import HandoverError
 from zbridge.transport import Parcel
 
@@ -20,13 +19,15 @@ ENDED = "^the other side has ended$"
 
 
 @pytest.fixture
-def ends() -> Iterator[tuple[Channel, socket.socket]]:
+def ends() -> Iterator[tuple[HandoverChannel, socket.socket]]:
     ours, theirs = socket.socketpair()
     with ours, theirs:
-        yield Channel(ours), theirs
+        yield HandoverChannel(ours), theirs
 
 
-async def test_an_end_is_told_as_such_while_sending_and_while_waiting(ends: tuple[Channel, socket.socket]) -> None:
+async def test_an_end_is_told_as_such_while_sending_and_while_waiting(
+    ends: tuple[HandoverChannel, socket.socket],
+) -> None:
     channel, other = ends
     other.close()
     with pytest.raises(EndError, match=ENDED):
@@ -35,7 +36,7 @@ async def test_an_end_is_told_as_such_while_sending_and_while_waiting(ends: tupl
         await channel.receive(Hello, 5.0)
 
 
-async def test_who_ends_with_a_message_of_ours_unread_has_ended(ends: tuple[Channel, socket.socket]) -> None:
+async def test_who_ends_with_a_message_of_ours_unread_has_ended(ends: tuple[HandoverChannel, socket.socket]) -> None:
     channel, other = ends
     await channel.send(Hello(VERSION, os.getpid()))
     other.close()
@@ -43,30 +44,32 @@ async def test_who_ends_with_a_message_of_ours_unread_has_ended(ends: tuple[Chan
         await channel.receive(Hello, 5.0)
 
 
-async def test_the_last_word_of_who_takes_nothing_any_more_is_the_reason(ends: tuple[Channel, socket.socket]) -> None:
+async def test_the_last_word_of_who_takes_nothing_any_more_is_the_reason(
+    ends: tuple[HandoverChannel, socket.socket],
+) -> None:
     channel, other = ends
-    Channel(other).say(Failed("its file is wrong"))
+    HandoverChannel(other).send_now(Failed("its file is wrong"))
     other.close()
     with pytest.raises(HandoverError, match="its file is wrong"):
         await channel.send(Hello(VERSION, os.getpid()))
 
 
-async def test_a_message_that_cannot_be_read_is_told_as_such(ends: tuple[Channel, socket.socket]) -> None:
+async def test_a_message_that_cannot_be_read_is_told_as_such(ends: tuple[HandoverChannel, socket.socket]) -> None:
     channel, other = ends
     for data in (b"\xc1", b"\x82\xa4type\xa6failed\xa6reason\xa1\xff"):
         other.sendall(len(data).to_bytes(4, "big") + data)
-        with pytest.raises(HandoverError, match="cannot be understood"):
+        with pytest.raises(HandoverError, match="sent an invalid message"):
             await channel.receive(Hello, 5.0)
 
 
 async def test_any_number_of_descriptors_crosses_in_order_and_no_child_inherits_them(
-    ends: tuple[Channel, socket.socket],
+    ends: tuple[HandoverChannel, socket.socket],
 ) -> None:
     channel, other = ends
     files = [tempfile.TemporaryFile() for _ in range(3)]  # noqa: SIM115
     numbers = [file.fileno() for file in files] * 70
     await channel.send(Hello(VERSION, 7), Parcel([os.dup(number) for number in numbers]))
-    theirs = Channel(other)
+    theirs = HandoverChannel(other)
     assert await theirs.receive(Hello, 5.0) == Hello(VERSION, 7)
     parcel = await theirs.receive_parcel(len(numbers), 5.0)
     assert [os.fstat(each).st_ino for each in parcel.descriptors] == [os.fstat(each).st_ino for each in numbers]
@@ -77,7 +80,7 @@ async def test_any_number_of_descriptors_crosses_in_order_and_no_child_inherits_
 
 
 async def test_descriptors_that_do_not_come_are_told_and_those_that_came_are_closed(
-    ends: tuple[Channel, socket.socket],
+    ends: tuple[HandoverChannel, socket.socket],
 ) -> None:
     channel, other = ends
     with tempfile.TemporaryFile() as file:
@@ -93,38 +96,38 @@ async def test_descriptors_that_do_not_come_are_told_and_those_that_came_are_clo
 
 
 async def test_a_message_that_is_not_expected_too_large_or_late_is_told(
-    ends: tuple[Channel, socket.socket], monkeypatch: pytest.MonkeyPatch
+    ends: tuple[HandoverChannel, socket.socket], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     channel, other = ends
-    Channel(other).say(Go())
+    HandoverChannel(other).send_now(Go())
     with pytest.raises(HandoverError, match="Go came instead of Hello"):
         await channel.receive(Hello, 5.0)
-    with pytest.raises(HandoverError, match=r"says nothing for 0\.02 s"):
+    with pytest.raises(HandoverError, match=r"sent nothing for 0\.02 s"):
         await channel.receive(Hello, 0.02)
     other.sendall((2**26 + 1).to_bytes(4, "big"))
     with pytest.raises(HandoverError, match="message of 67108865 bytes exceeds 67108864"):
         await channel.receive(Hello, 5.0)
 
 
-async def test_a_large_message_comes_whole(ends: tuple[Channel, socket.socket]) -> None:
+async def test_a_large_message_comes_whole(ends: tuple[HandoverChannel, socket.socket]) -> None:
     channel, other = ends
-    given = Given(VERSION, {"map": bytes(3 * 2**20)}, 0)
+    given = HandoverState(VERSION, {"map": bytes(3 * 2**20)}, 0)
     sending = asyncio.ensure_future(channel.send(given))
-    assert await Channel(other).receive(Given, 5.0) == given
+    assert await HandoverChannel(other).receive(HandoverState, 5.0) == given
     await sending
 
 
 async def test_who_takes_nothing_is_told_in_time(
-    ends: tuple[Channel, socket.socket], monkeypatch: pytest.MonkeyPatch
+    ends: tuple[HandoverChannel, socket.socket], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("SEND_S", "LAST_WORD_S"):
+    for name in ("SEND_S", "REASON_S"):
         monkeypatch.setattr(channels, name, 0.02)
-    with pytest.raises(HandoverError, match="the other side takes nothing: timed out"):
-        await ends[0].send(Given(VERSION, {"map": bytes(3 * 2**20)}, 0))
+    with pytest.raises(HandoverError, match="the other side is stalled: timed out"):
+        await ends[0].send(HandoverState(VERSION, {"map": bytes(3 * 2**20)}, 0))
 
 
-async def test_an_end_wakes_who_waits_and_may_be_told_twice(ends: tuple[Channel, socket.socket]) -> None:
-    theirs = Channel(ends[1])
+async def test_an_end_wakes_who_waits_and_may_be_told_twice(ends: tuple[HandoverChannel, socket.socket]) -> None:
+    theirs = HandoverChannel(ends[1])
     waiting = asyncio.ensure_future(theirs.receive(Hello))
     await asyncio.sleep(0.02)
     theirs.close()

@@ -11,9 +11,8 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from zbridge.app.handover.channel import Channel
+from zbridge.app.handover.channel import VERSION, Go, HandoverChannel, HandoverState, Hello, Up
 from zbridge.app.handover.incoming import Incoming
-from zbridge.app.handover.messages import VERSION, Given, Go, Hello, Up
 from zbridge.app.handover.outgoing import Outgoing
 from zbridge.errors import HandoverError, NotReady, Refused, Unsupported
 from zbridge.protocol.kept import Exported
@@ -58,13 +57,13 @@ class PlayedSuccessor:
 
     def __init__(self, steps: list[str], *, looks_after: bool) -> None:
         self.process = subprocess.Popen(["sleep", "3600"])
-        self.channel: Channel
+        self.channel: HandoverChannel
         self.unheard = False
         """Set when the supervisor hears nothing."""
         self._steps, self._looks_after = steps, looks_after
 
     async def start_successor(self, far_end: socket.socket) -> None:
-        self.channel = Channel(socket.socket(fileno=os.dup(far_end.fileno())))
+        self.channel = HandoverChannel(socket.socket(fileno=os.dup(far_end.fileno())))
 
     def handed_over(self) -> bool:
         if self.unheard:
@@ -74,7 +73,7 @@ class PlayedSuccessor:
 
     async def comes_up(self) -> None:
         await self.channel.send(Hello(VERSION, self.process.pid))
-        await self.channel.receive(Given, SOON_S)
+        await self.channel.receive(HandoverState, SOON_S)
         await self.channel.send(Up())
 
     def dies(self) -> None:
@@ -91,7 +90,7 @@ class Scene:
     def __init__(self, *, looks_after: bool) -> None:
         self.steps: list[str] = []
         self.successor = PlayedSuccessor(self.steps, looks_after=looks_after)
-        describe = lambda parcel: Given(VERSION, {}, 0)  # noqa: E731
+        describe = lambda parcel: HandoverState(VERSION, {}, 0)  # noqa: E731
         self.part = PlayedPart(self.steps)
         self.outgoing = Outgoing(self.successor, lambda: [self.part], describe, self._drain)
         self.drained = asyncio.Event()
@@ -130,7 +129,7 @@ alone = pytest.mark.parametrize("scene", [False], indirect=True)
 
 async def test_the_supervisor_is_told_before_the_successor_hears_go(scene: Scene) -> None:
     running = await scene.up()
-    with pytest.raises(HandoverError, match="says nothing"):
+    with pytest.raises(HandoverError, match="sent nothing"):
         await scene.successor.channel.receive(Go, 0.01)
     assert "handed over" not in scene.steps
     scene.drained.set()
@@ -178,7 +177,7 @@ async def test_a_gateway_that_ends_before_its_successor_says_hello_waits_for_not
     with pytest.raises(NotReady, match="the gateway ends"):
         await asyncio.wait_for(running, SOON_S)
     with pytest.raises(HandoverError, match="the gateway ends"):  # an end without a word would let it begin
-        await scene.successor.channel.receive(Given, SOON_S)
+        await scene.successor.channel.receive(HandoverState, SOON_S)
     assert scene.steps == []
 
 
@@ -209,7 +208,7 @@ async def test_a_successor_of_another_version_is_told_and_nothing_has_changed(sc
     with pytest.raises(NotReady, match=told):
         await running
     with pytest.raises(HandoverError, match=told):
-        await scene.successor.channel.receive(Given, SOON_S)
+        await scene.successor.channel.receive(HandoverState, SOON_S)
     assert scene.steps == []
 
 
@@ -249,16 +248,16 @@ async def test_a_gateway_that_dies_before_go_leaves_the_robot_to_its_successor_o
     supervised: bool,
 ) -> None:
     near, far = socket.socketpair()
-    before, incoming = Channel(near), Incoming(far, {}, supervised=supervised)
+    before, incoming = HandoverChannel(near), Incoming(far, {}, supervised=supervised)
     receiving = asyncio.ensure_future(incoming.receive())
     await before.receive(Hello, SOON_S)
-    await before.send(Given(VERSION, {}, 0))
+    await before.send(HandoverState(VERSION, {}, 0))
     await receiving
     finishing = asyncio.ensure_future(incoming.finish())
     await before.receive(Up, SOON_S)
     before.close()
     if supervised:
-        with pytest.raises(HandoverError, match="the supervisor looks after its robot"):
+        with pytest.raises(HandoverError, match="the supervisor stops its robot"):
             await finishing
     else:
         await finishing

@@ -10,9 +10,8 @@ from typing import Any
 
 import pytest
 
-from zbridge.app.handover.channel import Channel
+from zbridge.app.handover.channel import VERSION, Failed, Go, HandoverChannel, HandoverState, Hello, Up
 from zbridge.app.handover.incoming import Incoming
-from zbridge.app.handover.messages import VERSION, Failed, Given, Go, Hello, Up
 from zbridge.errors import HandoverError
 from zbridge.transport import Parcel
 
@@ -21,16 +20,18 @@ SETUP = {"robot": {"name": "r1"}, "hq[0]": ["alf"]}
 
 
 @pytest.fixture
-def pair() -> Iterator[tuple[Channel, Incoming]]:
+def pair() -> Iterator[tuple[HandoverChannel, Incoming]]:
     near, far = socket.socketpair()
-    before, incoming = Channel(near), Incoming(far, SETUP)
+    before, incoming = HandoverChannel(near), Incoming(far, SETUP)
     yield before, incoming
     before.close()
     incoming.parcel.close()
     incoming.fail("the test ends")
 
 
-async def received(pair: tuple[Channel, Incoming], given: Given, parcel: Parcel | None = None) -> Given:
+async def received(
+    pair: tuple[HandoverChannel, Incoming], given: HandoverState, parcel: Parcel | None = None
+) -> HandoverState:
     """Let the gateway before give something; return what the one that comes makes of it."""
     before, incoming = pair
     receiving = asyncio.ensure_future(incoming.receive())
@@ -40,12 +41,12 @@ async def received(pair: tuple[Channel, Incoming], given: Given, parcel: Parcel 
     return await receiving
 
 
-async def test_state_and_descriptors_are_taken_over_together(pair: tuple[Channel, Incoming]) -> None:
+async def test_state_and_descriptors_are_taken_over_together(pair: tuple[HandoverChannel, Incoming]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         parcel = Parcel()
         parcel.put(server.fileno())
-        given = Given(VERSION, SETUP, len(parcel), claim={"since": 1.0}, device={"a": 1}, listeners=({"b": 2},))
-        assert await received(pair, given, parcel) == given == pair[1].given
+        given = HandoverState(VERSION, SETUP, len(parcel), claim={"since": 1.0}, device={"a": 1}, listeners=({"b": 2},))
+        assert await received(pair, given, parcel) == given == pair[1].state
         parcel.close()
         (taken,) = pair[1].parcel.descriptors
         assert os.fstat(taken).st_ino == os.fstat(server.fileno()).st_ino
@@ -63,22 +64,22 @@ CHANGED: list[tuple[dict[str, Any], str]] = [
 
 @pytest.mark.parametrize(("fields", "told"), CHANGED)
 async def test_what_another_version_or_another_configuration_made_is_refused(
-    pair: tuple[Channel, Incoming], fields: dict[str, Any], told: str, monkeypatch: pytest.MonkeyPatch
+    pair: tuple[HandoverChannel, Incoming], fields: dict[str, Any], told: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("zbridge.app.handover.incoming.PARCEL_S", 0.05)
     with pytest.raises(HandoverError, match=told):
-        await received(pair, Given(**{"version": VERSION, "setup": SETUP, "descriptors": 0, **fields}))
+        await received(pair, HandoverState(**{"version": VERSION, "setup": SETUP, "descriptors": 0, **fields}))
 
 
 async def test_it_is_up_when_the_last_part_is_taken_over_and_every_part_begins_at_the_word(
-    pair: tuple[Channel, Incoming],
+    pair: tuple[HandoverChannel, Incoming],
 ) -> None:
     before, incoming = pair
-    await received(pair, Given(VERSION, SETUP, 0, device={}, listeners=({}, {})))
-    parts = [asyncio.ensure_future(incoming.taken()) for _ in range(2)]
-    with pytest.raises(HandoverError, match="says nothing"):
+    await received(pair, HandoverState(VERSION, SETUP, 0, device={}, listeners=({}, {})))
+    parts = [asyncio.ensure_future(incoming.part_taken_over()) for _ in range(2)]
+    with pytest.raises(HandoverError, match="sent nothing"):
         await before.receive(Up, 0.02)
-    parts.append(asyncio.ensure_future(incoming.taken()))
+    parts.append(asyncio.ensure_future(incoming.part_taken_over()))
     await before.receive(Up, SOON_S)
     assert not any(part.done() for part in parts)
     assert not incoming.begun.is_set()
@@ -87,18 +88,18 @@ async def test_it_is_up_when_the_last_part_is_taken_over_and_every_part_begins_a
     assert incoming.begun.is_set()
 
 
-async def test_a_robot_that_is_not_served_is_no_part(pair: tuple[Channel, Incoming]) -> None:
+async def test_a_robot_that_is_not_served_is_no_part(pair: tuple[HandoverChannel, Incoming]) -> None:
     before, incoming = pair
-    await received(pair, Given(VERSION, SETUP, 0, listeners=({},)))
-    part = asyncio.ensure_future(incoming.taken())
+    await received(pair, HandoverState(VERSION, SETUP, 0, listeners=({},)))
+    part = asyncio.ensure_future(incoming.part_taken_over())
     await before.receive(Up, SOON_S)
     await before.send(Go())
     await part
 
 
-async def test_a_gateway_that_takes_everything_back_ends_its_successor(pair: tuple[Channel, Incoming]) -> None:
+async def test_a_gateway_that_takes_everything_back_ends_its_successor(pair: tuple[HandoverChannel, Incoming]) -> None:
     before, incoming = pair
-    await received(pair, Given(VERSION, SETUP, 0))
+    await received(pair, HandoverState(VERSION, SETUP, 0))
     finishing = asyncio.ensure_future(incoming.finish())
     await before.receive(Up, SOON_S)
     await before.send(Failed("the robot moves"))
@@ -107,7 +108,7 @@ async def test_a_gateway_that_takes_everything_back_ends_its_successor(pair: tup
     assert not incoming.begun.is_set()
 
 
-async def test_why_a_successor_ends_is_told(pair: tuple[Channel, Incoming]) -> None:
+async def test_why_a_successor_ends_is_told(pair: tuple[HandoverChannel, Incoming]) -> None:
     before, incoming = pair
     incoming.fail("its file is wrong")
     with pytest.raises(HandoverError, match="its file is wrong"):

@@ -9,22 +9,23 @@ from typing import Any
 
 import pytest
 
-from zbridge.app.config import Plan, plan
+from zbridge.app.config import GatewayPlan, plan
 from zbridge.app.handover import restarts as module
+from zbridge.app.handover.channel import VERSION, HandoverState
 from zbridge.app.handover.incoming import Incoming
-from zbridge.app.handover.messages import VERSION, Given
-from zbridge.app.handover.restarts import Restarts
+from zbridge.app.handover.restarts import ClaimPart, Restarts
 from zbridge.bus.fake import FakeBus
 from zbridge.errors import NotReady, Refused
 from zbridge.fleet.topics import KeySpace
 from zbridge.protocol.kept import Budget, Exported
+from zbridge.robot.ownership import Ownership
 from zbridge.transport import Parcel
 
 DEVICE = {"protocol": "alf", "connect": ["tcp://127.0.0.1:1"]}
 ASKED = "fleet/r1/@rpc/restart/ann"
 
 
-def planned(**bus: Any) -> Plan:
+def planned(**bus: Any) -> GatewayPlan:
     return plan({"robot": {"name": "r1"}, "device": DEVICE, "bus": bus})
 
 
@@ -72,7 +73,7 @@ class PlayedOutgoing:
         self,
         successor: object,
         parts: Callable[[], list[Any]],
-        describe: Callable[[Parcel], Given],
+        describe: Callable[[Parcel], HandoverState],
         drain: Callable[[], Any],
         *machine: object,
     ) -> None:
@@ -91,7 +92,7 @@ def handovers(monkeypatch: pytest.MonkeyPatch) -> list[PlayedOutgoing]:
     return PlayedOutgoing.made
 
 
-def made(config: Plan | None = None, incoming: Incoming | None = None, successor: Any = "some") -> Restarts:
+def made(config: GatewayPlan | None = None, incoming: Incoming | None = None, successor: Any = "some") -> Restarts:
     return Restarts(config or planned(), KeySpace("fleet", "r1"), incoming, successor)
 
 
@@ -216,7 +217,23 @@ def test_a_robot_is_kept_for_a_successor_only_where_it_is_owned_and_can_go_on(
     restarts = made()
     if device is not None or claim is not None:
         restarts.device, restarts.claim = Part(device), Part(claim)  # type: ignore[assignment]
-    given = restarts.keep(Parcel(), Budget(1000))
+    given = restarts.deposit(Parcel(), Budget(1000))
     assert (given is not None) is kept
     if given is not None:
         assert (given.version, given.device, given.claim, given.listeners) == (VERSION, device, claim, ())
+
+
+async def test_a_claim_that_is_withdrawn_for_the_successor_is_still_deposited_and_comes_back() -> None:
+    ownership = Ownership(FakeBus("1"), KeySpace("fleet", "r1"), clock=lambda: 5.0)
+    part = ClaimPart(ownership)
+    assert part.hand_over(Parcel()) == {}
+    claim = {"since": 2.0, "yielded": False, "close_until": 4.0}
+    ownership.inherit(claim)
+    assert part.hand_over(Parcel()) == claim
+    part.withdraw()
+    assert ownership.export() is None
+    assert part.hand_over(Parcel()) == claim, "the successor may die before it has deposited any"
+    await part.go_on()
+    assert ownership.export() == claim
+    ownership.release()
+    assert part.hand_over(Parcel()) == {}

@@ -10,8 +10,7 @@ from contextlib import suppress
 import pytest
 
 from zbridge.app.config import plan
-from zbridge.app.handover.channel import Channel
-from zbridge.app.handover.messages import VERSION, Given, Hello
+from zbridge.app.handover.channel import VERSION, HandoverChannel, HandoverState, Hello
 from zbridge.app.handover.restarts import Restarts
 from zbridge.app.tasks import together
 from zbridge.errors import HandoverError, NotReady
@@ -62,13 +61,13 @@ class PlayedSuccessor:
         self.task: asyncio.Task[None]
 
     async def start_successor(self, far_end: socket.socket) -> None:
-        channel = Channel(socket.socket(fileno=os.dup(far_end.fileno())))
+        channel = HandoverChannel(socket.socket(fileno=os.dup(far_end.fileno())))
         self.task = asyncio.ensure_future(self._take(channel))
 
-    async def _take(self, channel: Channel) -> None:
+    async def _take(self, channel: HandoverChannel) -> None:
         await channel.send(Hello(VERSION, 0))
         with suppress(HandoverError):
-            await channel.receive(Given, 10.0)
+            await channel.receive(HandoverState, 10.0)
             self.given.set()
             await channel.receive(Hello, 10.0)
         channel.close()

@@ -9,11 +9,6 @@ import msgspec
 import pytest
 
 from tests.certificates import Authority, openssl
-from zbridge.app.certs import authority, x509
-from zbridge.app.certs.authority import Request
-from zbridge.app.certs.files import Folder
-from zbridge.app.certs.reading import load_certificate
-from zbridge.app.roles import Member
 from zbridge.bus import Tls
 from zbridge.bus.tls.certificate import Certificate, read_certificate
 from zbridge.bus.tls.files import (
@@ -26,6 +21,10 @@ from zbridge.bus.tls.files import (
     unusable,
 )
 from zbridge.errors import ConfigError
+from zbridge.security.certs import authority, x509
+from zbridge.security.certs.authority import CertificateRequest, load_certificate
+from zbridge.security.certs.files import Folder
+from zbridge.security.roles import Member
 
 NOW = datetime(2026, 11, 22, 12, 0, 0, tzinfo=UTC)
 DAY = timedelta(days=1)
@@ -35,8 +34,8 @@ DAY = timedelta(days=1)
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Folder:
     folder = Folder(tmp_path_factory.mktemp("lab") / "certs")
     authority.init(folder, NOW)
-    authority.issue(folder, Request("hub", Member("router"), ("hub.lab",)), NOW)
-    authority.issue(folder, Request("g1", Member("gateway", ("r1",)), days=90), NOW)
+    authority.issue(folder, CertificateRequest("hub", Member("router"), ("hub.lab",)), NOW)
+    authority.issue(folder, CertificateRequest("g1", Member("gateway", ("r1",)), days=90), NOW)
     return folder
 
 

@@ -6,13 +6,13 @@ from datetime import UTC, datetime
 
 import pytest
 
-from zbridge.app.access import GRANTS, Keys, Kind
 from zbridge.bus import Answer
 from zbridge.bus.tls.certificate import Certificate
 from zbridge.bus.tls.membership import Right, lacking, require_member, router_id
 from zbridge.errors import BusError, BusRefused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import Membership
+from zbridge.security.access import GRANTS, Keys, MessageKind
 
 NOW = datetime(2026, 11, 22, tzinfo=UTC)
 KEY = "fleet/@bus/whoami/g1"
@@ -101,7 +101,7 @@ def test_the_rights_are_those_of_the_access_rules(right: Right, keys: Keys) -> N
     granted = {
         column
         for column, grants in GRANTS.items()
-        if any(grant.keys is keys and Kind.QUERY in grant.kinds for grant in grants)
+        if any(grant.keys is keys and MessageKind.QUERY in grant.kinds for grant in grants)
     }
     assert set(right.value[1]) == granted - {"gateway with listeners"}
 

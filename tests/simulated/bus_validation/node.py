@@ -11,10 +11,10 @@ import time
 from typing import Any
 
 from tests.simulated.bus_validation.agent import Agent
-from zbridge.app.router_settings import RouterSettings, plan_router, zenoh_values
 from zbridge.bus import BusSettings, open_router
 from zbridge.bus.zenoh import open_zenoh
 from zbridge.metrics import Metrics
+from zbridge.security.router_settings import RouterSettings, plan_router, zenoh_values
 
 
 async def main(listen: str, connect: str) -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
-from zbridge.app.toml import convert
 from zbridge.errors import ConfigError
+from zbridge.toml import convert
 from zbridge.views.ros2.settings import RobotBody, Ros2Settings, plan
 
 FILE = {

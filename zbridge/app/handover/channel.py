@@ -1,7 +1,7 @@
 """The Unix stream socket between a gateway and its successor: messages, and descriptors behind one of them.
 
-A message is its length (4 bytes, big-endian) and its bytes. Descriptors follow in groups, each with one byte. The calls
-block on threads of their own, so that the event loop never does; each has a time limit.
+A message is its length (4 bytes, big-endian) and a MessagePack map with a ``type``. Descriptors follow in groups, each
+with one byte. The calls block on threads of their own, so that the event loop never does; each has a time limit.
 """
 
 from __future__ import annotations
@@ -14,16 +14,19 @@ from typing import TypeVar
 
 import msgspec
 
-from zbridge.app.handover.messages import Failed, Message, decode, encode
 from zbridge.errors import HandoverError
+from zbridge.protocol.kept import Exported
 from zbridge.transport import Parcel
+from zbridge.wire.frames import Partial
 
+VERSION = 2
+"""The form of :class:`HandoverState`. Raise it with every change of what is ``kept`` and of the maps around it."""
 M = TypeVar("M")
 
 MESSAGE_BYTES = 64 * 2**20
 """Bound of a message: a state with the largest map takes 4 MB."""
-LAST_WORD_S = 0.2
-"""Seconds for what the other side said before it took nothing any more."""
+REASON_S = 0.2
+"""Seconds for the reason that the other side sent before it closed."""
 SEND_S = 5.0
 """Longest time that a message may take to be sent."""
 _GROUP = 200
@@ -32,7 +35,52 @@ _HEADER = 4
 _ENDED = "the other side has ended"
 
 
-class Channel:
+class Hello(msgspec.Struct, tag="hello", frozen=True):
+    """Successor: I have read the configuration and joined the bus; ``version``: of the state that I accept."""
+
+    version: int
+    pid: int
+
+
+class HandoverState(msgspec.Struct, tag="given", frozen=True):
+    """Gateway: nothing is read or written any more; take this over, and ``descriptors`` descriptors behind it.
+
+    setup: what must be the same in both configurations. claim: on the robot, None where it is not owned. device: None
+    where it is not served. listeners: in the order of the configuration; none of a gateway that died: the successor
+    binds its own. metrics: numbers of sockets in the parcel. partials: of a gateway that died, the incomplete frame of
+    each stream, in the order of the device's links.
+    """
+
+    version: int
+    setup: Exported
+    descriptors: int
+    claim: Exported | None = None
+    device: Exported | None = None
+    listeners: tuple[Exported, ...] = ()
+    metrics: tuple[int, ...] = ()
+    partials: tuple[Partial, ...] = ()
+
+
+class Up(msgspec.Struct, tag="up", frozen=True):
+    """Successor: everything is taken over and declared; I read and write nothing before :class:`Go`."""
+
+
+class Go(msgspec.Struct, tag="go", frozen=True):
+    """Gateway: all is yours."""
+
+
+class Failed(msgspec.Struct, tag="failed", frozen=True):
+    """Either: it is over, for this reason. The gateway resumes."""
+
+    reason: str
+
+
+Message = Hello | HandoverState | Up | Go | Failed
+encode = msgspec.msgpack.Encoder().encode
+decode = msgspec.msgpack.Decoder(Message).decode
+
+
+class HandoverChannel:
     """One end of the socket. Errors are HandoverError, with the other side's reason where it gave one."""
 
     def __init__(self, end: socket.socket) -> None:
@@ -40,7 +88,7 @@ class Channel:
         end.setblocking(True)
 
     def __repr__(self) -> str:
-        return f"<Channel {self._socket.fileno()}>"
+        return f"<HandoverChannel {self._socket.fileno()}>"
 
     async def send(self, message: Message, parcel: Parcel | None = None) -> None:
         """Send a message, and the descriptors of a parcel."""
@@ -54,8 +102,8 @@ class Channel:
         """Wait for the descriptors behind a message."""
         return await asyncio.to_thread(self._receive_parcel, descriptors, timeout_s)
 
-    def say(self, message: Message) -> None:
-        """Send a short message if the socket takes it at once: nothing more is awaited from the other side."""
+    def send_now(self, message: Message) -> None:
+        """Send a short message if the socket accepts it at once: nothing more is awaited from the other side."""
         with contextlib.suppress(OSError, HandoverError):
             self._send(message, None)
 
@@ -75,10 +123,10 @@ class Channel:
                 socket.send_fds(self._socket, [b"."], descriptors[start : start + _GROUP])
         except OSError as error:
             with contextlib.suppress(EndError, SilentError):
-                self._receive(Failed, LAST_WORD_S)  # it may have said why it ends
+                self._receive(Failed, REASON_S)  # it may have sent why it ends
             if isinstance(error, ConnectionError):
                 raise EndError(_ENDED) from error
-            raise HandoverError(f"the other side takes nothing: {error}") from error
+            raise HandoverError(f"the other side is stalled: {error}") from error
 
     def _receive(self, kind: type[M], timeout_s: float | None) -> M:
         try:
@@ -88,11 +136,11 @@ class Channel:
                 raise HandoverError(f"message of {size} bytes exceeds {MESSAGE_BYTES}")
             message = decode(self._read(size))
         except TimeoutError as error:
-            raise SilentError(f"the other side says nothing for {timeout_s:g} s") from error
+            raise SilentError(f"the other side sent nothing for {timeout_s:g} s") from error
         except OSError as error:  # reset: it ended with a message of ours unread
             raise EndError(_ENDED) from error
         except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
-            raise HandoverError(f"the other side cannot be understood: {error}") from error
+            raise HandoverError(f"the other side sent an invalid message: {error}") from error
         if isinstance(message, Failed):
             raise HandoverError(message.reason)
         if not isinstance(message, kind):
@@ -126,8 +174,8 @@ class Channel:
 
 
 class EndError(HandoverError):
-    """The other side has ended without a word."""
+    """The other side has ended without a reason."""
 
 
 class SilentError(HandoverError):
-    """The other side says nothing in time."""
+    """The other side sends nothing in time."""

@@ -1,4 +1,4 @@
-"""The gateway that goes: starts its successor, hands everything over, and is released or goes on. Knows no protocol.
+"""The gateway that goes: starts its successor, hands everything over, and is released or resumes. Knows no protocol.
 
 Theory of operation. The order of the steps keeps two promises: two processes never read or write one socket, and
 nothing is lost that this gateway cannot take back.
@@ -6,13 +6,13 @@ nothing is lost that this gateway cannot take back.
 1. The successor is started, reads its configuration and joins the bus. Meanwhile this gateway works as ever.
 2. ``prepare``: the robot is stopped, its lease ended, no command taken; every link has taken what was written.
 3. ``hold``: nothing is read, written or accepted. ``hand_over`` describes all of it: a value of that moment.
-4. The successor holds the same connections, has declared its keys, and says that it is up.
-5. ``withdraw``: this gateway's commands and its claim leave the bus. It says *go*, and ``release`` closes its copies of
-   the sockets. From *go* on the successor reads and writes.
+4. The successor holds the same connections, has declared its keys, and reports that it is up.
+5. ``withdraw``: this gateway's commands and its claim leave the bus. It sends *go*, and ``release`` closes its copies
+   of the sockets. From *go* on the successor reads and writes.
 
 Until *go* every failure leads back: the successor is killed, and only when it has ended this gateway reads again.
 
-Where a supervisor started the successor, the supervisor is told of *go* first (:meth:`Successor.handed_over`). From
+Where a supervisor started the successor, the supervisor is notified before *go* (:meth:`Successor.handed_over`). From
 then on it treats the successor as the robot's gateway, and nothing leads back.
 """
 
@@ -24,10 +24,8 @@ import logging
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Protocol, TypeVar
 
-from zbridge.app.handover.channel import Channel
-from zbridge.app.handover.messages import VERSION, Failed, Given, Go, Hello, Up
-from zbridge.app.handover.processes import PROCESSES, OtherProcess, Processes
-from zbridge.app.handover.successor import Successor
+from zbridge.app.handover.channel import VERSION, Failed, Go, HandoverChannel, HandoverState, Hello, Up
+from zbridge.app.handover.processes import PROCESSES, OtherProcess, Processes, Successor
 from zbridge.errors import BusError, HandoverError, NotReady, Refused
 from zbridge.protocol.kept import Exported
 from zbridge.transport import Parcel
@@ -46,8 +44,8 @@ TAKE_OVER_S = 5.0
 """Longest time until the successor has taken everything over; nothing is read or written meanwhile."""
 
 
-class Part(Protocol):
-    """What is handed over: the device, or a listener."""
+class HandoverPart(Protocol):
+    """What is handed over: the device, a listener, or the claim."""
 
     async def prepare(self, reason: str, within_s: float) -> None:
         """Stop what moves, and wait until it can be handed over; raise Refused."""
@@ -71,7 +69,7 @@ class Part(Protocol):
         """Give up what another process has now."""
 
 
-Describe = Callable[[Parcel], Given]
+Describe = Callable[[Parcel], HandoverState]
 """``describe(parcel)``: what is handed over, once all parts are held."""
 
 
@@ -87,7 +85,7 @@ class Outgoing:
     def __init__(
         self,
         successor: Successor,
-        parts: Callable[[], Sequence[Part]],
+        parts: Callable[[], Sequence[HandoverPart]],
         describe: Describe,
         drain: Callable[[], Awaitable[None]],
         processes: Processes = PROCESSES,
@@ -95,7 +93,7 @@ class Outgoing:
     ) -> None:
         self._successor = successor
         self._find_parts = parts
-        self._parts: Sequence[Part] = ()
+        self._parts: Sequence[HandoverPart] = ()
         self._describe = describe
         self._drain = drain
         self._processes = processes
@@ -118,11 +116,11 @@ class Outgoing:
         try:
             with far:
                 await self._successor.start_successor(far)
-            hello = await self._hear(channel, Hello, START_S)
-            self._know(hello)
+            hello = await self._receive(channel, Hello, START_S)
+            self._accept(hello)
             changed, self._parts = True, self._find_parts()
-            await self._give(channel)
-            await self._hear(channel, Up, TAKE_OVER_S)
+            await self._send_state(channel)
+            await self._receive(channel, Up, TAKE_OVER_S)
             for part in self._parts:
                 part.withdraw()
             await self._drain()
@@ -147,14 +145,14 @@ class Outgoing:
         return hello.pid
 
     def give_up(self) -> None:
-        """Give the handover up, for the gateway ends: everything is taken back, unless the successor is told to go."""
+        """Give the handover up, for the gateway ends: everything is taken back, unless *go* was sent."""
         self._ends.set()
 
     def _require_no_end(self) -> None:
         if self._ends.is_set():
             raise HandoverError("the gateway ends")
 
-    async def _hear(self, channel: Channel, kind: type[M], within_s: float) -> M:
+    async def _receive(self, channel: HandoverChannel, kind: type[M], within_s: float) -> M:
         """Wait for a message of the successor; raise HandoverError where the gateway ends meanwhile."""
         message = asyncio.ensure_future(channel.receive(kind, within_s))
         ends = asyncio.ensure_future(self._ends.wait())
@@ -166,7 +164,7 @@ class Outgoing:
             message.cancel()
             ends.cancel()
 
-    async def _give(self, channel: Channel) -> None:
+    async def _send_state(self, channel: HandoverChannel) -> None:
         """Stop, hold and describe everything; send it."""
         await asyncio.gather(*(part.prepare(RESTARTED, PREPARE_S) for part in self._parts))
         for part in self._parts:
@@ -179,10 +177,10 @@ class Outgoing:
         finally:
             parcel.close()
 
-    async def _take_back(self, channel: Channel, reason: str, *, changed: bool) -> None:
-        """End the successor; go on when it has ended."""
+    async def _take_back(self, channel: HandoverChannel, reason: str, *, changed: bool) -> None:
+        """End the successor; resume when it has ended."""
         log.error("not restarted: %s", reason)
-        channel.say(Failed(reason))
+        channel.send_now(Failed(reason))
         if self._process is not None:
             await self._process.kill()
             self._forget()
@@ -193,7 +191,7 @@ class Outgoing:
 
     # The process of the successor
 
-    def _know(self, hello: Hello) -> None:
+    def _accept(self, hello: Hello) -> None:
         if hello.version != VERSION:
             raise HandoverError(f"the successor takes states of version {hello.version}, this gateway has {VERSION}")
         self._process = self._processes.process(hello.pid)

@@ -1,6 +1,7 @@
-"""What a handover needs of the operating system: the socket between two processes, and the end of the other process.
+"""What a handover needs of the operating system: the socket between two processes, the end of the other process, and a
+successor that is started, with a supervisor or, as here, without one.
 
-A simulation injects its own in the place of :data:`PROCESSES`.
+A simulation injects its own processes in the place of :data:`PROCESSES`.
 """
 
 from __future__ import annotations
@@ -11,11 +12,19 @@ import os
 import select
 import signal
 import socket
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Protocol
 
-from zbridge.app.handover.channel import Channel
+from zbridge.app.handover.channel import HandoverChannel
+from zbridge.errors import HandoverError
 
 END_S = 2.0
 """Longest wait for the end of a process that was killed, seconds."""
+COMMAND = [sys.executable, "-m", "zbridge"]
+"""The installed version of this program."""
 
 
 class OtherProcess:
@@ -55,14 +64,14 @@ class Processes:
         """The number of this process."""
         return os.getpid()
 
-    def pair(self) -> tuple[Channel, socket.socket]:
+    def pair(self) -> tuple[HandoverChannel, socket.socket]:
         """Make a channel, and the far end of its socket for a successor; raise OSError."""
         near, far = socket.socketpair()
-        return Channel(near), far
+        return HandoverChannel(near), far
 
-    def channel(self, end: socket.socket) -> Channel:
+    def channel(self, end: socket.socket) -> HandoverChannel:
         """Make a channel of the end that another process made."""
-        return Channel(end)
+        return HandoverChannel(end)
 
     def process(self, pid: int) -> OtherProcess:
         """Return the process of this number."""
@@ -71,3 +80,85 @@ class Processes:
 
 PROCESSES = Processes()
 """Those of this machine."""
+
+
+class Successor(Protocol):
+    """Who starts successors of this process."""
+
+    async def start_successor(self, far_end: socket.socket) -> None:
+        """Start a process that owns the far end; raise HandoverError where none can be started.
+
+        The caller closes its own copy of the far end afterwards, in any case.
+        """
+
+    def handed_over(self) -> bool:
+        """Note that the successor has the robot from now on; called before *go* is sent to it.
+
+        True: a supervisor stops the robot whatever happens to either process, so there is no way back. False: nobody
+        does; this process takes everything back if *go* cannot be sent.
+        """
+
+
+class Spawn:
+    """Starts ``zbridge run FILE --take-over FD`` as a child, which lives on when this process has ended."""
+
+    def __init__(self, file: Path, *, verbose: bool = False) -> None:
+        self._file = file
+        self._verbose = verbose
+        self.process: subprocess.Popen[bytes] | None = None
+        """The process that was started last."""
+
+    def __repr__(self) -> str:
+        return f"<Spawn {self._file} {self.process.pid if self.process else ''}>"
+
+    async def start_successor(self, far_end: socket.socket) -> None:
+        """Start the process; it is waited for where it ends before we do."""
+        try:
+            self.process = await asyncio.to_thread(self._start, far_end.fileno())
+        except OSError as error:
+            raise HandoverError(f"no process can be started: {error}") from error
+
+    def handed_over(self) -> bool:
+        """Return False: no supervisor monitors the two processes."""
+        return False
+
+    def _start(self, descriptor: int) -> subprocess.Popen[bytes]:
+        if self.process is not None:
+            self.process.poll()
+        command = [*COMMAND, "run", str(self._file), "--take-over", str(descriptor)]
+        command += ["--verbose"] if self._verbose else []
+        return subprocess.Popen(command, pass_fds=(descriptor,))
+
+    def notify_systemd(self) -> None:
+        """Tell systemd, where it started us, which process serves the robot from now on."""
+        if self.process is not None:
+            Systemd().notify(f"MAINPID={self.process.pid}", waits=True)
+            self.process.returncode = 0  # it outlives us: Popen must not complain at our end
+
+
+class Systemd:
+    """The socket that systemd named in the environment (``sd_notify``); does nothing where it named none.
+
+    watchdog_s: seconds between two notifications of the watchdog; 0: none is wanted.
+    """
+
+    def __init__(self, environment: Mapping[str, str] = os.environ, pid: int | None = None) -> None:
+        path = environment.get("NOTIFY_SOCKET", "")
+        self._address = "\0" + path[1:] if path.startswith("@") else path
+        mine = environment.get("WATCHDOG_PID") in (None, str(pid or os.getpid()))
+        wanted = environment.get("WATCHDOG_USEC", "")
+        self.watchdog_s = int(wanted) / 2_000_000 if mine and self._address and wanted.isdecimal() else 0.0
+
+    def __repr__(self) -> str:
+        return f"<Systemd {self._address or 'absent'}>"
+
+    def notify(self, *lines: str, waits: bool = False) -> bool:
+        """Send lines such as ``READY=1`` and ``STATUS=8 robots``; False if they found no room. waits: for room."""
+        if self._address:
+            try:
+                with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as end:
+                    end.setblocking(waits)
+                    end.sendto("\n".join(lines).encode(), self._address)
+            except OSError:
+                return False
+        return True

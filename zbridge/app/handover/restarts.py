@@ -1,4 +1,4 @@
-"""The restarts of one gateway: who may ask for one, what is handed over, and how it is answered."""
+"""The restarts of one gateway: who may ask for one, what is handed over (also the claim), and how it is answered."""
 
 from __future__ import annotations
 
@@ -11,13 +11,11 @@ from collections.abc import Callable, Sequence
 
 import msgspec
 
-from zbridge.app.config import Plan
-from zbridge.app.handover.claim import ClaimPart
+from zbridge.app.config import GatewayPlan
+from zbridge.app.handover.channel import VERSION, HandoverState
 from zbridge.app.handover.incoming import Incoming
-from zbridge.app.handover.messages import VERSION, Given
-from zbridge.app.handover.outgoing import Outgoing, Part
-from zbridge.app.handover.processes import PROCESSES, Processes
-from zbridge.app.handover.successor import Successor
+from zbridge.app.handover.outgoing import HandoverPart, Outgoing
+from zbridge.app.handover.processes import PROCESSES, Processes, Successor
 from zbridge.bus import Bus, Handle, IncomingQuery
 from zbridge.control.admission import NameFilter
 from zbridge.control.latch_store import LatchStore
@@ -26,13 +24,56 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Query
 from zbridge.fleet.topics import KeySpace
-from zbridge.protocol.kept import Budget
+from zbridge.protocol.kept import Budget, Exported
 from zbridge.robot.device import Device
-from zbridge.robot.ownership import CLAIM
+from zbridge.robot.ownership import CLAIM, Ownership
 from zbridge.transport import Parcel
 from zbridge.transport.kernel import KERNEL, Kernel
 
 log = logging.getLogger("zbridge.app.handover")
+
+
+class ClaimPart:
+    """The claim of a gateway that owns its robot."""
+
+    def __init__(self, ownership: Ownership) -> None:
+        self._ownership = ownership
+        self._claim: Exported | None = None
+        self._withdrawn = False
+
+    def __repr__(self) -> str:
+        return f"<ClaimPart {self._ownership!r}>"
+
+    async def prepare(self, reason: str, within_s: float) -> None:
+        """Report the successor's claim as no rival's."""
+        self._ownership.hands_over = True
+
+    async def shut(self) -> None:
+        """Do nothing."""
+
+    def hold(self) -> None:
+        """Do nothing."""
+
+    def hand_over(self, parcel: Parcel) -> Exported:
+        """Describe the claim; ``{}`` where the robot is not owned. One that was withdrawn is the successor's."""
+        if not self._withdrawn:
+            self._claim = self._ownership.export()
+        return self._claim or {}
+
+    async def go_on(self) -> None:
+        """Claim the robot again, where the claim was withdrawn."""
+        self._ownership.hands_over = self._withdrawn = False
+        if self._claim is not None and self._ownership.export() is None:
+            self._ownership.inherit(self._claim)
+            self._ownership.begin()
+
+    def withdraw(self) -> None:
+        """Leave the claim, and the liveliness token, to the successor's."""
+        self._withdrawn = True
+        self._ownership.release()
+
+    async def release(self) -> None:
+        """Do nothing: the claim is withdrawn."""
 
 
 class Restarts:
@@ -44,7 +85,7 @@ class Restarts:
 
     def __init__(
         self,
-        plan: Plan,
+        plan: GatewayPlan,
         keys: KeySpace,
         incoming: Incoming | None,
         successor: Successor | None,
@@ -56,7 +97,7 @@ class Restarts:
         self._processes = processes
         self._kernel = kernel
         self.bus: Bus | None = None
-        self.listeners: Sequence[Part] = ()
+        self.listeners: Sequence[HandoverPart] = ()
         self.device: Device | None = None
         self.claim: ClaimPart | None = None
         self.latches: LatchStore | None = None
@@ -95,13 +136,13 @@ class Restarts:
         async with self._lock:
             return
 
-    def keep(self, parcel: Parcel, budget: Budget) -> Given | None:
+    def deposit(self, parcel: Parcel, budget: Budget) -> HandoverState | None:
         """Describe the robot's part as it is now, for a successor of a gateway that died; None where none can go on."""
         device = self.device.keep(parcel, budget) if self.device is not None else None
         claim = self.claim.hand_over(parcel) if self.claim is not None else None
         if device is None or not claim:
             return None
-        return Given(VERSION, self._plan.setup, len(parcel), claim=claim, device=device)
+        return HandoverState(VERSION, self._plan.setup, len(parcel), claim=claim, device=device)
 
     def answer(self, bus: Bus) -> Handle:
         """Restart for whoever the access rules let ask, and answer when that is done."""
@@ -144,7 +185,7 @@ class Restarts:
             pid = await self._outgoing.run()
             log.info("handed over to process %d in %.0f ms", pid, (self._clock() - began) * 1000)
 
-    def _parts(self) -> list[Part]:
+    def _parts(self) -> list[HandoverPart]:
         """Give what there is to hand over now."""
         self._handed_over = self.device
         return [part for part in (*self.listeners, self.device, self.claim) if part is not None]
@@ -161,9 +202,9 @@ class Restarts:
         if self.bus is not None and self.claim is not None:
             await self.bus.drain(self._keys.key(CLAIM))  # the successor answers
 
-    def _describe(self, parcel: Parcel) -> Given:
+    def _describe(self, parcel: Parcel) -> HandoverState:
         self._require_same_device()
-        given = Given(
+        state = HandoverState(
             VERSION,
             self._plan.setup,
             0,
@@ -172,4 +213,4 @@ class Restarts:
             listeners=tuple(part.hand_over(parcel) for part in self.listeners),
             metrics=tuple(parcel.put(sock.fileno()) for sock in self.metrics_sockets),
         )
-        return msgspec.structs.replace(given, descriptors=len(parcel))
+        return msgspec.structs.replace(state, descriptors=len(parcel))

@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from zbridge.app.toml import read_toml
 from zbridge.errors import ConfigError, PayloadError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Authorization, FleetMessage, Sessions, Text
 from zbridge.fleet.topics import Topic, split_key
+from zbridge.toml import read_toml
 from zbridge.views.recording.reader import EXTRA
 from zbridge.views.schemas import Schema
 

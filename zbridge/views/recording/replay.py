@@ -13,7 +13,6 @@ import msgspec
 
 from zbridge.app.config import plan as plan_configuration
 from zbridge.app.tasks import together
-from zbridge.app.toml import read_toml
 from zbridge.bus import Bus, Handle, Sample
 from zbridge.control.latch import LatchRecord
 from zbridge.errors import ConfigError, Held, PayloadError, ZbridgeError
@@ -25,6 +24,7 @@ from zbridge.hq import Listener, ListenerPlan, RobotSubscription
 from zbridge.metrics import Metrics
 from zbridge.protocol.session_table import SessionTable
 from zbridge.robot.ownership import Claim, Ownership, Standing
+from zbridge.toml import read_toml
 from zbridge.views.recording.contents import MSGPACK, is_wire
 from zbridge.views.recording.player import Player
 from zbridge.views.recording.reader import RecordedMessage, RecordingReader, open_recording

@@ -1,0 +1,59 @@
+"""What a gateway's certificate is good for, before it is used: what is wrong with it, and what is to be warned of.
+
+Nothing here asks a router, and nothing needs the package ``cryptography``.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from zbridge.app.config import GatewayPlan
+from zbridge.bus import Tls
+from zbridge.bus.tls.certificate import Certificate
+from zbridge.bus.tls.files import is_of_authority, own_certificate, unusable
+from zbridge.errors import ConfigError
+from zbridge.security.roles import ROLES
+
+
+def check_member(plan: GatewayPlan) -> Certificate | None:
+    """Return the certificate of a gateway's bus, None without one; raise ConfigError for what no time will mend.
+
+    That is: files that are not there, do not match, or can be read by others, and a role that does not fit.
+    """
+    tls = plan.config.bus.tls
+    if tls is None:
+        return None
+    if tls.certificate is None or tls.key is None:
+        raise ConfigError("bus.tls: expected ca, certificate and key: a secure bus knows everybody by a certificate")
+    from zbridge.security.certs.files import read_secret  # of use on a secure bus alone
+
+    certificate = own_certificate(tls)
+    read_secret(Path(tls.key))
+    if problem := unusable(tls):
+        raise ConfigError(problem)
+    if not is_of_authority(tls):
+        raise ConfigError(f"{tls.certificate}: issued by another authority than {tls.ca}")
+    assert certificate is not None
+    _check_role(plan, tls, certificate)
+    return certificate
+
+
+def not_checked(plan: GatewayPlan, certificate: Certificate) -> str:
+    """Return a note on what only the router can check."""
+    what = "serve" if plan.device is not None else "serve HQ programs of"
+    return (
+        f"not checked: whether the router knows {certificate.common_name} and lets it {what} {plan.config.robot.name}"
+    )
+
+
+def _check_role(plan: GatewayPlan, tls: Tls, certificate: Certificate) -> None:
+    needed = "gateway" if plan.device is not None else "hq"
+    if certificate.role == needed or certificate.role not in ROLES:  # not ours: its rules are its owner's
+        return
+    if plan.device is None and certificate.role == "gateway":  # one with listeners may do what an hq may
+        return
+    part = "[device]" if plan.device is not None else "[[hq]] and no [device]"
+    raise ConfigError(
+        f"{tls.certificate}: the certificate of {certificate.common_name}: expected the role {needed} for a file with"
+        f" {part}"
+    )

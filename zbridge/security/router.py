@@ -1,0 +1,157 @@
+"""One Zenoh router process: opens it, answers members who they are, and logs who comes and whom Zenoh refuses and why.
+
+Zenoh lets a certificate of its authority connect whatever the name, and an unknown name hears silence. So each member
+can ask ``<realm>/@bus/whoami/<name>``, which the access rules let only that name ask: no answer means that this router
+does not know the name.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import re
+import time
+from collections.abc import Callable
+
+from zbridge.bus import Bus, IncomingQuery, Neighbour, open_router
+from zbridge.errors import BusError, ConfigError
+from zbridge.fleet import payload as payloads
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Membership
+from zbridge.metrics import Metrics
+from zbridge.security.router_settings import RouterPlan, zenoh_values
+
+log = logging.getLogger("zbridge.security.router")
+
+FOLD_S = 10.0
+"""Seconds within which the same warning is logged once, with how often it came before."""
+KINDS = 64
+"""Different warnings that are counted apart; all others share one."""
+
+
+class Router:
+    """A router, from its plan to its end."""
+
+    def __init__(self, plan: RouterPlan) -> None:
+        self._plan = plan
+        self._known = {plan.roles.common_name(name) for name in plan.roles.names}
+
+    def __repr__(self) -> str:
+        return f"<Router {' '.join(self._plan.settings.listen)}>"
+
+    async def run(self) -> None:
+        """Route until cancelled; raise ConfigError where an address or a TLS file cannot be used."""
+        settings = self._plan.settings
+        try:
+            bus = await open_router(zenoh_values(self._plan), Metrics(), self.note)
+        except BusError as error:
+            raise ConfigError(f"no router at {', '.join(settings.listen)}: {error}") from error
+        try:
+            self._serve(bus)
+            log.info("router at %s: %s", ", ".join(settings.listen), self._summary())
+            await asyncio.Event().wait()
+        finally:
+            await bus.close()
+
+    def note(self, neighbour: Neighbour, here: bool) -> None:
+        """Log a process that connects or leaves."""
+        name = neighbour.name or "somebody"
+        if not here:
+            log.info("%s left, from %s", name, neighbour.address)
+        elif self._plan.settings.tls is not None and neighbour.name not in self._known:
+            log.warning(
+                "%s connected from %s: its certificate is of this authority, but roles.toml does not name it: it hears"
+                " nothing and may do nothing",
+                name,
+                neighbour.address,
+            )
+        else:
+            log.info("%s connected from %s", name, neighbour.address)
+
+    def answer(self, query: IncomingQuery) -> None:
+        """Tell a member who it is."""
+        name = query.asked.rpartition("/")[2]
+        member = self._plan.roles.names.get(name)
+        if member is not None:
+            query.answer(payloads.encode(Membership(name=name, role=member.role, robots=member.robots)))
+
+    def _serve(self, bus: Bus) -> None:
+        if self._plan.settings.tls is not None:
+            bus.answer(topics.whoami(self._plan.settings.realm, "*"), self.answer)
+
+    def _summary(self) -> str:
+        if self._plan.settings.tls is None:
+            return "without tls, whoever reaches it may do everything"
+        names = self._plan.roles.names
+        robots = {robot for member in names.values() for robot in member.robots}
+        return f"mutual TLS, {len(names)} names, {len(robots)} robots in realm {self._plan.settings.realm}"
+
+
+class ZenohWarnings:
+    """Logs Zenoh's log in the terms of this project; :meth:`take` is called with each of its lines.
+
+    A peer that tries again and again would fill the log: the same warning is logged once in :data:`FOLD_S`.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._logged: dict[str, tuple[float, int]] = {}
+        """By warning, when it was logged, and how often it came since."""
+
+    def __repr__(self) -> str:
+        return f"<ZenohWarnings {len(self._logged)}>"
+
+    def take(self, line: str) -> None:
+        """Log one line of Zenoh's log."""
+        level, text = in_our_words(line)
+        if text not in self._logged and len(self._logged) >= KINDS:
+            text = "more kinds of Zenoh warnings than are counted apart"
+        at, more = self._logged.get(text, (-FOLD_S, 0))
+        now = self._clock()
+        if now - at < FOLD_S:
+            self._logged[text] = (at, more + 1)
+            return
+        self._logged[text] = (now, 0)
+        log.log(level, "%s%s", text, f" ({more} times more since it was last logged)" if more else "")
+
+
+def in_our_words(line: str) -> tuple[int, str]:
+    """Return the level and the text of one line of Zenoh's log."""
+    for pattern, text in _WORDS:
+        if re.search(pattern, line):
+            return logging.WARNING, text
+    match = _LINE.match(line)
+    if match is None or _LOGGED_ELSEWHERE in line:
+        return logging.DEBUG, line
+    return _LEVELS[match["level"]], f"Zenoh: {_TAIL.sub('', match['text'])}"
+
+
+_LINE = re.compile(r"\S+Z\s+(?P<level>ERROR|WARN|INFO|DEBUG|TRACE) .*?(?P<text>zenoh\S*: .*)")
+_TAIL = re.compile(r"\.? Hint: increase the system open file limit\.|\s+at /\S+\.rs:\d+\.?")
+_LOGGED_ELSEWHERE = "Unable to open listener"
+"""Also an error, which ends the process with its text."""
+_LEVELS = {
+    "ERROR": logging.ERROR,
+    "WARN": logging.WARNING,
+    "INFO": logging.INFO,
+    "DEBUG": logging.DEBUG,
+    "TRACE": logging.DEBUG,
+}
+_REFUSED = "refused a connection:"
+_RENEW = "its certificate has expired (zbridge certs renew)"
+_WORDS = (
+    ("remote certificate chain expired", f"closed a connection: {_RENEW}"),
+    ("certificate expired", f"{_REFUSED} {_RENEW}, or a clock is wrong"),
+    ("not valid yet", f"{_REFUSED} its certificate is not valid yet: the clock of one machine is wrong"),
+    ("peer sent no certificates", f"{_REFUSED} it showed no certificate"),
+    ("UnknownIssuer|BadSignature", f"{_REFUSED} its certificate is of another authority"),
+    ("InvalidContentType", f"{_REFUSED} it spoke no TLS: plain TCP, or something else than Zenoh"),
+    ("invalid peer certificate", f"{_REFUSED} its certificate is not valid"),
+    ("UnknownCA", f"{_REFUSED} it does not know the authority of this router's certificate"),
+    ("CertificateExpired", f"{_REFUSED} it says that this router's certificate has expired"),
+    ("received fatal alert", f"{_REFUSED} it did not accept this router's certificate: its name, authority or dates"),
+    ("handshake eof|[Uu]nexpected eof", f"{_REFUSED} it ended before it had said who it was"),
+    ("Unknown \\w+ id", "a member took back a token, subscription or queryable that its rules had not let through"),
+    ("Too many open files", "no more connections: this process may open no more files (ulimit -n)"),
+)
+"""Patterns of Zenoh's lines, and what is logged instead. The first match counts."""

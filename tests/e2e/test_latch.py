@@ -77,12 +77,12 @@ def test_a_gateway_that_was_away_adopts_the_fleets_latch_and_none_that_was_relea
     latch(bench, "*", one)
     bench.serve(bench.simulator(), robot="r2")
     assert refused(bench, "r2")
-    assert latched(bench, "r2", one)
+    until(lambda: latched(bench, "r2", one), what="the latched stop of the fleet")
     latch(bench, "*", other)
     assert asked(bench, "r1", "unlatch_fleet", id=one) == {}
     bench.serve(bench.simulator(), robot="r3")
     assert refused(bench, "r3")
-    assert latched(bench, "r3", other)
+    until(lambda: latched(bench, "r3", other), what="the latched stop of the fleet")
     assert not latched(bench, "r3", one)
     assert asked(bench, "r2", "unlatch", id=one)["code"] == "unsupported"
     for robot in ("r1", "r2", "r3"):

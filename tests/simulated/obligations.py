@@ -283,7 +283,7 @@ class Obligations:
     def probed(self) -> None:
         """The robot was driven, and rests."""
         robot = self.simulation.robot
-        if robot.crashed or getattr(robot, "single", False):
+        if robot.crashed or robot.single or robot.used_up:
             return
         if "read" not in self._probe:
             self.checker.violate("drivable", "nobody can drive the robot long after all faults are over")

@@ -90,6 +90,9 @@ class Obligations:
     def _on_robot(self, what: str, fields: tuple[Any, ...]) -> None:
         if what == "connected":
             self._connected_at = self.world.now
+            grant = self.checker.current.get(self.checker.by_host.get(fields[0][0], ""))
+            if grant is not None:  # docs/control.md, "hold back": a robot that was lost is stopped when it comes back
+                grant.autonomous = False
         elif what in ("drops", "ignores"):
             self._dropped_at = self.world.now
             self.checker.counts[f"robot {what}"] += 1

@@ -88,6 +88,16 @@ def _reconnected(rng: random.Random, made: Made) -> None:
     made["steps"].append(_drive(t + rng.uniform(0.6, 1.5), "op2", takeover=True))
 
 
+def _reconnected_in_mode_3(rng: random.Random, made: Made) -> None:
+    """The connection to a robot that drives itself is reset; its driver still holds the lease, and says nothing."""
+    options = {"version": rng.choice(("1.1", "1.3", "1.4")), "lossless": bool(made["control"])}
+    made["robot"] = {"protocol": "tcpudp", "options": options, "device": {}}
+    made["drivers"][0]["options"] = {}  # the client that chooses modes
+    made["steps"] = [_drive(3.0, "op1", mode="autonomous", silent=True) | {"for": 9.0}]
+    after = rng.uniform(0.0, 3.0)
+    made["steps"].append(_fault(2.9, "reset", between=["robot", "gw1"], when="mode read", after=round(after, 3)))
+
+
 def _wiggled_over_a_cut(rng: random.Random, made: Made) -> None:
     """An HQ program pushes and releases its stick while its network is cut, and all of it arrives at once."""
     gateway, t = _stick(rng, made, alone=rng.random() < 0.5), 5.0
@@ -227,6 +237,7 @@ SITUATIONS: tuple[Callable[[random.Random, Made], None], ...] = (
     _silent_holder,
     _stalled_link,
     _reconnected,
+    _reconnected_in_mode_3,
     _wiggled_over_a_cut,
     _frozen_listener,
     _frozen_shortly,

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Installs zbridge on a Debian host (12 or newer): a virtual environment in /opt/zbridge, the configuration in /etc/zbridge, a user, systemd units.
-# Run it again to upgrade or to repair: what is right is left alone, and nothing in /etc/zbridge is overwritten.
+# Run it again to upgrade or to repair: it leaves alone what is correct, and never overwrites a file in /etc/zbridge.
 set -euo pipefail
 
 usage() {
@@ -8,14 +8,14 @@ usage() {
 usage: install.sh [--wheels PATH] [--extras LIST] [--router] [--recorder] [--serial] [--no-start]
        install.sh --uninstall [--purge]
 
---wheels PATH   a folder with zbridge's wheel and all that it needs, or the wheel in such a folder: nothing is downloaded.
-                Make it on a machine with a network: pip wheel -w wheels '.[certs,serial]', with foxglove for --recorder
-                Without it: installs the checkout that this script is in, and downloads the rest.
---extras LIST   extras of zbridge, separated by commas; "certs,serial" by default, with a recorder foxglove too; "" for none
+--wheels PATH   a folder with the wheels of zbridge and its dependencies, or the zbridge wheel in such a folder; downloads nothing.
+                Build it on a machine with a network: pip wheel -w wheels '.[certs,serial]', with foxglove for --recorder
+                Without --wheels: installs the checkout that contains this script, and downloads the dependencies.
+--extras LIST   extras of zbridge, separated by commas; default "certs,serial", and foxglove with a recorder; "" for none
 --router        also run the router of the bus      (/etc/zbridge/router.toml, /etc/zbridge/router)
 --recorder      also record all robots              (/etc/zbridge/recorder.env, /etc/zbridge/recorder)
 --serial        let gateways open serial lines
---no-start      enable the units, start nothing
+--no-start      enable the units, but start none
 --uninstall     stop and remove the units and /opt/zbridge; keep /etc/zbridge, /var/lib/zbridge and the recordings
 --purge         with --uninstall: remove those and the user as well
 END
@@ -44,32 +44,32 @@ while [ $# -gt 0 ]; do
         --uninstall) uninstall=yes ;;
         --purge) purge=yes ;;
         -h | --help) usage; exit 0 ;;
-        *) wrong "$1: unknown" ;;
+        *) wrong "$1: unknown option" ;;
     esac
     shift
 done
-[ -z "$purge" ] || [ -n "$uninstall" ] || wrong "--purge: expected --uninstall with it"
+[ -z "$purge" ] || [ -n "$uninstall" ] || wrong "--purge: requires --uninstall"
 if [ "$extras" = default ]; then
     extras=certs,serial
     if [ -n "$recorder" ] || [ -L "$units/multi-user.target.wants/zbridge-recorder.service" ]; then extras+=,foxglove; fi
 fi
 [ "$(id -u)" -eq 0 ] || die "must be run as root"
 
-# systemd may be absent (a chroot, an image that is being built): then units are enabled for the next boot.
+# Without a running systemd (a chroot, an image build) the units are enabled for the next boot.
 booted() { [ -d /run/systemd/system ]; }
 has_systemctl() { command -v systemctl >/dev/null; }
 
-put() { # SOURCE TARGET [MODE]: copy where it differs; tells whether something changed
+put() { # SOURCE TARGET [MODE]: copies a file that differs; succeeds if it changed the target
     if cmp -s "$1" "$2"; then return 1; fi
     install -D -m "${3:-0644}" "$1" "$2"
     say "wrote $2"
 }
 
-keep() { # SOURCE TARGET MODE: copy where there is nothing yet
+keep() { # SOURCE TARGET MODE: copies a file unless the target exists
     [ -e "$2" ] || put "$1" "$2" "$3"
 }
 
-instances() { # the units of single robots that were enabled
+instances() { # prints the enabled units of single robots
     local link
     for link in "$units"/multi-user.target.wants/zbridge@*.service; do
         [ ! -L "$link" ] || basename "$link"
@@ -78,9 +78,9 @@ instances() { # the units of single robots that were enabled
 
 remove() {
     local unit
-    # Instances may run without being enabled; the router ends last, for gateways tell the bus that they end.
+    # Instances may run without being enabled. The router stops last, because gateways say goodbye on the bus.
     for unit in 'zbridge@*.service' zbridge.service zbridge-recorder.service zbridge-router.service; do
-        if booted; then systemctl stop "$unit" 2>/dev/null || ! systemctl is-active --quiet "$unit" || die "$unit does not stop"; fi
+        if booted; then systemctl stop "$unit" 2>/dev/null || ! systemctl is-active --quiet "$unit" || die "$unit did not stop: see journalctl -u ${unit%.service}"; fi
     done
     for unit in $(instances) zbridge.service zbridge-recorder.service zbridge-router.service; do
         ! has_systemctl || systemctl disable --quiet "$unit" 2>/dev/null || true
@@ -116,15 +116,15 @@ install_package() {
             folder=$(dirname "$wheels") file=$wheels
         else
             file=$(find "$folder" -maxdepth 1 -name 'zbridge-*.whl' | sort -V | tail -n 1)
-            [ -n "$file" ] || die "--wheels $wheels: no zbridge-*.whl in it" 2
+            [ -n "$file" ] || die "--wheels $wheels: contains no zbridge-*.whl" 2
         fi
         what=$(realpath "$file") options=(--no-index --find-links "$(realpath "$folder")")
     else
         what=$(dirname "$here")
-        [ -f "$what/pyproject.toml" ] || die "$what is no checkout of zbridge: give --wheels" 2
+        [ -f "$what/pyproject.toml" ] || die "$what is not a checkout of zbridge: pass --wheels" 2
     fi
     [ -x "$prefix/bin/python" ] || { rm -rf "$prefix"; python3 -m venv "$prefix"; }
-    # The same version may have other contents: the package itself is always installed anew, its dependencies only where needed.
+    # The same version may have other contents, so the package itself is always reinstalled, its dependencies only if needed.
     "$prefix/bin/pip" install --quiet --disable-pip-version-check --no-input "${options[@]}" --upgrade "$what${extras:+[$extras]}"
     "$prefix/bin/pip" install --quiet --disable-pip-version-check --no-input "${options[@]}" --force-reinstall --no-deps "$what"
     [ "$(readlink -f /usr/local/bin/zbridge)" = "$prefix/bin/zbridge" ] || ln -sfn "$prefix/bin/zbridge" /usr/local/bin/zbridge
@@ -146,15 +146,15 @@ install_files() {
     if booted && [ -n "$changed" ]; then systemctl daemon-reload; fi
 }
 
-up() { # UNIT WHAT-IT-NEEDS WHERE: enable the unit, and start it if what it needs is there
+up() { # UNIT CONDITION GLOB: enables the unit, and starts it if files match GLOB
     systemctl enable --quiet "$1"
     if ! booted || [ -z "$start" ]; then say "$1: enabled"; return; fi
-    if ! compgen -G "$3" >/dev/null; then say "$1: enabled; it starts when $2: systemctl start ${1%.service}"; return; fi
+    if ! compgen -G "$3" >/dev/null; then say "$1: enabled, not started. Once $2, run: systemctl start ${1%.service}"; return; fi
     if systemctl is-active --quiet "$1"; then
-        say "$1: runs on with what it has"
+        say "$1: already running, left alone"
         return
     fi
-    systemctl start "$1" || die "$1 does not start: journalctl -u ${1%.service} -n 30"
+    systemctl start "$1" || die "$1 did not start: see journalctl -u ${1%.service} -n 30"
     say "$1: started"
 }
 
@@ -163,9 +163,9 @@ check_host
 install_package
 install_files
 [ -z "$router" ] || up zbridge-router.service "the router's bundle is in $etc/router" "$etc/router/key.pem"
-up zbridge.service "there is a robot in $etc/robots" "$etc/robots/*.toml"
+up zbridge.service "a robot file is in $etc/robots" "$etc/robots/*.toml"
 [ -z "$recorder" ] || up zbridge-recorder.service "the recorder's bundle is in $etc/recorder" "$etc/recorder/key.pem"
 if booted && systemctl is-active --quiet zbridge.service; then
-    sleep 3 # a supervisor loads what has not changed for 2 s
-    say "what runs keeps the version that it was started with: systemctl reload zbridge, then zbridge restart --all"
+    sleep 3 # a supervisor loads only code that has not changed for 2 s
+    say "running gateways keep their version. To upgrade them: systemctl reload zbridge, then zbridge restart --all"
 fi

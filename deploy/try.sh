@@ -1,20 +1,20 @@
 #!/usr/bin/env bash
-# Tries the deployment for real, as far as this machine allows:  sudo bash deploy/try.sh [units] [host] [container] [chart]
-# Each part has a temporary folder, and sees devices and a /run of its own: what is outside stays as it was, and that is looked at afterwards.
-# A part that cannot run says why, and is not counted as passed.
+# Tests the deployment for real, as far as this machine allows:  sudo bash deploy/try.sh [units] [host] [container] [chart]
+# Each part has a temporary folder, and devices and a /run of its own. At the end the script checks that the machine outside is unchanged.
+# A part that cannot run reports why, and does not count as passed.
 set -euo pipefail
 
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 parts=("$@")
 [ ${#parts[@]} -gt 0 ] || parts=(units host container chart)
 for part in "${parts[@]}"; do
-    case $part in units | host | container | chart) ;; *) echo "$part: unknown; known are units, host, container, chart" >&2; exit 2 ;; esac
+    case $part in units | host | container | chart) ;; *) echo "$part: unknown part; expected units, host, container or chart" >&2; exit 2 ;; esac
 done
 work=$(mktemp -d /var/tmp/zbridge-try.XXXXXX)
-# What was interrupted may have left mounts below: nothing behind them is removed.
-trap 'rm -rf --one-file-system "$work" 2>/dev/null || echo "left behind: $work"' EXIT
+# An interrupted part may have left mounts below: remove nothing behind them.
+trap 'rm -rf --one-file-system "$work" 2>/dev/null || echo "could not remove: $work"' EXIT
 
-outside() { # what programs of containers are known to change: owners of devices, and control groups that stay behind
+outside() { # prints what container programs are known to change: owners of devices, and leftover control groups
     stat --format '%n %U:%G %a %t:%T' /dev/null /dev/zero /dev/full /dev/random /dev/urandom /dev/tty
     find /sys/fs/cgroup -type d \( -name 'libpod*' -o -name payload -o -name supervisor \) 2>/dev/null | sort
 }
@@ -43,9 +43,9 @@ for part in "${parts[@]}"; do
 done
 if ! outside | diff "$work/outside" -; then
     failed=$((failed + 1))
-    echo "FAILED: the machine is not as it was"
+    echo "FAILED: devices or control groups of the machine have changed (above)"
 else
-    echo "ok: the machine's devices and control groups are as they were"
+    echo "ok: the machine's devices and control groups are unchanged"
 fi
 echo "$passed passed, $failed failed, $absent cannot run here"
 [ "$failed" -eq 0 ]

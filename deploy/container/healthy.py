@@ -1,6 +1,6 @@
-"""The check of the image: whether each gateway answers whose file has ``[metrics]``. Exit code 0 or 1.
+"""The image's health check: queries each gateway whose file has ``[metrics]``. Exit code 1 if one does not answer.
 
-Reads files and asks over HTTP; it needs no bus and no certificate, and so little time that it may run often.
+Reads files and queries over HTTP. It needs no bus and no certificate, and is fast enough to run often.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ EVERYWHERE = {"0.0.0.0": "127.0.0.1", "::": "::1"}
 
 
 def addresses(folder: Path) -> list[tuple[str, str, int]]:
-    """List robot, host and port of each file with an endpoint; of a faulty file the supervisor tells."""
+    """List robot, host and port of each file with an endpoint; skip faulty files, which the supervisor reports."""
     found = []
     for path in sorted(folder.glob("*.toml")):
         try:
@@ -30,7 +30,7 @@ def addresses(folder: Path) -> list[tuple[str, str, int]]:
 
 
 def answers(host: str, port: int) -> bool:
-    """Whether ``/healthz`` says that the process lives."""
+    """Tell whether ``/healthz`` reports a live process."""
     connection = http.client.HTTPConnection(host, port, timeout=WITHIN_S)
     try:
         connection.request("GET", "/healthz")
@@ -42,7 +42,7 @@ def answers(host: str, port: int) -> bool:
 
 
 def main(folder: Path) -> int:
-    """Ask all gateways, and name those that do not answer."""
+    """Query all gateways, print those that do not answer, and return the exit code."""
     asked = addresses(folder)
     silent = [robot for robot, host, port in asked if not answers(host, port)]
     print(

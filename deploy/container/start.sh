@@ -1,18 +1,18 @@
 #!/bin/sh
-# The first process of a container: runs zbridge, and outlives it. When the first process ends, the kernel kills all others at once. So this one stays
-# while the gateway lives that a restart handed the robot to, and after a supervisor that died until its gateways have stopped their robots, for 5 s at most.
+# The first process of a container: runs zbridge, and outlives it. When the first process ends, the kernel kills all others at once. This process
+# therefore waits for the successor of a restarted gateway, and, after the supervisor died, up to 5 s until the gateways have stopped their robots.
 child='' ended='' stopping=''
-tell() { # all that is left, once zbridge has ended; zbridge before
+signal() { # SIGNAL: signals zbridge, or, once it has ended, all remaining processes
     if [ -n "$ended" ]; then kill "-$1" -1 2>/dev/null; elif [ -n "$child" ]; then kill "-$1" "$child"; fi
 }
-trap 'stopping=yes; tell TERM' TERM INT
-trap 'tell HUP' HUP
-trap 'tell USR2' USR2
+trap 'stopping=yes; signal TERM' TERM INT
+trap 'signal HUP' HUP
+trap 'signal USR2' USR2
 
-exec 3<&0 # in the background a shell gives nothing to read
+exec 3<&0 # a background process of a shell gets /dev/null as its standard input
 /opt/zbridge/bin/zbridge "$@" <&3 3<&- &
 child=$!
-[ -z "$stopping" ] || tell TERM
+[ -z "$stopping" ] || signal TERM
 
 code=0
 while # a signal interrupts the wait
@@ -22,7 +22,7 @@ while # a signal interrupts the wait
 do :; done
 ended=yes
 
-others() { # whether another process lives
+others() { # succeeds if another process lives
     for stat in /proc/[0-9]*/stat; do
         read -r state 2>/dev/null <"$stat" || continue
         case $state in "$$ "* | *") Z "*) ;; *) return 0 ;; esac

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# apart.sh FOLDER COMMAND...: runs a command that sees devices and a /run of its own; the namespace of mounts was made by deploy/try.sh.
-# Why: runtimes of containers give the devices that they are handed, /dev/null among them, to the container's user.
+# apart.sh FOLDER COMMAND...: runs a command with devices and a /run of its own, in the mount namespace that deploy/try.sh made.
+# Reason: container runtimes change the owner of the devices that they pass to a container, including /dev/null.
 set -euo pipefail
 new=${1:?usage: apart.sh FOLDER COMMAND...}/dev
 shift
@@ -27,5 +27,5 @@ mount --move "$new" /dev
 rmdir "$new"
 mount -t tmpfs -o mode=755,nosuid,nodev run /run
 
-# The standard input that was opened before may be the machine's own /dev/null.
+# The inherited standard input may be the machine's own /dev/null.
 exec "$@" </dev/null

@@ -1,7 +1,7 @@
-"""Renders the chart with Helm's library and checks what comes out.
+"""Renders the chart with Helm's library, and checks the result.
 
-Usage: chart.py HELM-FOLDER OUTPUT, a folder that is made; chart.py --same A B tells whether two files hold the same
-objects.
+Usage: chart.py HELM-FOLDER OUTPUT, which creates the folder OUTPUT; chart.py --same A B, which exits with 0 if both
+files contain the same objects.
 """
 
 import subprocess
@@ -19,9 +19,9 @@ WRONG: dict[str, dict[str, Any]] = {
     "an unknown key": {"nonsense": 1},
     "a robot without a certificate": {"robots": {"r1": {"device": ROBOT["device"]}}},
     "a robot that is neither robot nor listener": {"robots": {"r1": {"secret": "a"}}},
-    "a name that keys cannot have": {"robots": {"r 1": ROBOT}},
-    "a router in the open": {"router": {"connect": ["tcp/hub:7447"]}},
-    "a network that is none": {"networkPolicy": {"routerFrom": ["lab"]}},
+    "a name that is invalid in keys": {"robots": {"r 1": ROBOT}},
+    "a router without TLS": {"router": {"connect": ["tcp/hub:7447"]}},
+    "an invalid network": {"networkPolicy": {"routerFrom": ["lab"]}},
     "a listener at one address": {
         "robots": {"r1": {**ROBOT, "hq": [{"protocol": "alf", "listen": "tcp://127.0.0.1:1"}]}}
     },
@@ -32,12 +32,12 @@ Object = dict[str, Any]
 
 
 def identity(item: Object) -> tuple[str, str]:
-    """What makes an object this one."""
+    """Return kind and name, which identify an object."""
     return item["kind"], item["metadata"]["name"]
 
 
 def objects(text: str) -> list[Object]:
-    """Read objects in the order of their kinds and names."""
+    """Read objects, sorted by kind and name."""
     return sorted((item for item in yaml.safe_load_all(text) if item), key=identity)
 
 
@@ -49,7 +49,7 @@ def render(folder: Path, values: Object) -> str:
 
 
 def check_pods(items: list[Object]) -> None:
-    """Every pod is confined, and has limits; every one has a policy of its own."""
+    """Check that every pod is confined, and has limits and a network policy of its own."""
     policies = [item["spec"]["podSelector"]["matchLabels"] for item in items if item["kind"] == "NetworkPolicy"]
     for item in items:
         if item["kind"] != "Deployment":
@@ -65,13 +65,13 @@ def check_pods(items: list[Object]) -> None:
 
 
 def zbridge(*words: str | Path) -> None:
-    """Run a command of zbridge; show what it says if it fails."""
+    """Run a command of zbridge; show its errors if it fails."""
     done = subprocess.run([sys.executable, "-m", "zbridge", *words], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
 
 def check_files(items: list[Object], output: Path) -> int:
-    """Let zbridge check the robots' files, each with a certificate of its robot; how many there were."""
+    """Run `zbridge check` on the robots' files, each with a certificate of its robot; return their number."""
     zbridge("certs", "init", output / "certs")
     issue = ("certs", "issue", "--dir", output / "certs")
     zbridge(*issue, "hub", "--role", "router", "--host", "zb-router")
@@ -101,18 +101,17 @@ def main(folder: Path, output: Path) -> None:
             for item in items:
                 kubernetes_validate.validate(item, version, strict=True)
         check_pods(items)
-        print(
-            f"ok: Helm {helm.helm_sdk_version()}: {len(items)} objects as Kubernetes {', '.join(KUBERNETES)} have them"
-        )
+        versions = ", ".join(KUBERNETES)
+        print(f"ok: Helm {helm.helm_sdk_version()}: {len(items)} objects match the schemas of Kubernetes {versions}")
     (output / "all.yaml").write_text(text)
-    print(f"ok: {check_files(items, output)} robots' files, by zbridge check")
+    print(f"ok: {check_files(items, output)} robot files pass zbridge check")
     for what, values in WRONG.items():
         try:
             render(folder, values)
         except helm.HelmError:
             continue
         raise AssertionError(f"{what} is accepted")
-    print(f"ok: {len(WRONG)} wrong values are refused")
+    print(f"ok: {len(WRONG)} wrong values are rejected")
 
 
 if sys.argv[1] == "--same":

@@ -1,13 +1,13 @@
 #!/usr/bin/env bash
-# Runs in the network that deploy/try/container.sh made: the composition with one fragile robot. Usage: composed.sh FOLDER
+# Tests the composition with one fragile robot, in the network namespace that deploy/try/container.sh made. Usage: composed.sh FOLDER
 # shellcheck source-path=SCRIPTDIR disable=SC2015
 source "$(dirname "${BASH_SOURCE[0]}")/common.sh"
 cd "$work"
 ip link set lo up
-# crun knows control groups of either kind, not both at once.
+# crun supports control groups of version 1 or 2, not both at once.
 ! mountpoint --quiet /sys/fs/cgroup/unified || umount /sys/fs/cgroup/unified
 compose() { podman-compose --file "$root/deploy/container/compose.yaml" "$@" >"$work/compose.log" 2>&1; }
-robot='' # what is as fragile as a deployed robot serves one connection a start; start it anew
+robot='' # the fragile robot serves one connection per start, as deployed ones do: robot() restarts it
 robot() {
     [ -z "$robot" ] || { kill "$robot" 2>/dev/null || true; wait "$robot" 2>/dev/null || true; }
     [ "${1:-}" = gone ] || { "$work/tools/bin/python" "$root/deploy/try/robot.py" 11001 r1.account >robot.log 2>&1 & robot=$!; }
@@ -19,7 +19,7 @@ over() {
 }
 trap 'over $?' EXIT
 one_connection() { ! grep -e '^violation' -e 'second connection' -e 'ended' r1.account | grep -v '(this process'; }
-driven() { # LIMIT_S COMMAND...: r1 is driven while the command runs, and must come to rest; tells after how long
+driven() { # LIMIT_S COMMAND...: drives r1 while the command runs; r1 must stop within LIMIT_S; sets rest to the time
     rest=$(python "$root/deploy/try/driven.py" ann r1 r1.account "$@" 2>driven.log) || { cat driven.log; fail "$rest"; }
 }
 
@@ -31,15 +31,15 @@ ok "router, gateways and recorder run; r1 is established over mutual TLS"
 container() { podman ps --filter "name=$1" --format '{{.Names}}'; }
 router=$(container router) gateways=$(container gateways) recorder=$(container recorder)
 for name in $router $gateways $recorder; do
-    podman exec "$name" sh -c 'touch /x 2>/dev/null' && fail "$name: the root is writable"
-    podman exec "$name" sh -c 'grep -q "^CapBnd:.0*$" /proc/1/status && grep -q "^NoNewPrivs:.1" /proc/1/status && [ "$(id -u)" = 10001 ]' || fail "$name has rights"
+    podman exec "$name" sh -c 'touch /x 2>/dev/null' && fail "$name: the root file system is writable"
+    podman exec "$name" sh -c 'grep -q "^CapBnd:.0*$" /proc/1/status && grep -q "^NoNewPrivs:.1" /proc/1/status && [ "$(id -u)" = 10001 ]' || fail "$name has capabilities, new privileges or another user"
 done
-ok "read-only roots, no capabilities, user 10001"
-within 20 podman healthcheck run "$router" || fail "the router's check"
-ok "the router's check"
-podman exec "$gateways" python3 /opt/zbridge/healthy.py | grep '^1 of 1' >/dev/null || fail "the gateways' check asks nobody"
-podman healthcheck run "$gateways" >/dev/null || fail "the gateways' check"
-ok "the gateways' check"
+ok "read-only root file systems, no capabilities, user 10001"
+within 20 podman healthcheck run "$router" || fail "the router's health check"
+ok "the router's health check"
+podman exec "$gateways" python3 /opt/zbridge/healthy.py | grep '^1 of 1' >/dev/null || fail "the gateways' check queries no gateway"
+podman healthcheck run "$gateways" >/dev/null || fail "the gateways' health check"
+ok "the gateways' health check"
 
 metrics=http://127.0.0.1:9100
 within 10 answers $metrics/readyz 200 || fail "/readyz"
@@ -54,36 +54,36 @@ within 20 answers $metrics/readyz 503 || fail "/readyz without the robot"
 answers $metrics/healthz 200 || fail "/healthz without the robot"
 reason=$(page $metrics/readyz | sed -n 3p)
 robot
-established || fail "r1 is not back"
-within 10 answers $metrics/readyz 200 || fail "/readyz when the robot is back"
-ok "/readyz follows the robot (without it 503: $reason), /healthz does not; /metrics: $counted"
+established || fail "r1 is not established again"
+within 10 answers $metrics/readyz 200 || fail "/readyz after the robot returned"
+ok "/readyz reports the robot (503 without it: $reason), /healthz stays 200; /metrics: $counted"
 
 main() { podman inspect --format '{{.State.Pid}}' "$gateways"; }
 supervisor() { pgrep --parent "$(main)" --full 'zbridge run' | head -n 1; }
 gateway() { pgrep --ns "$(main)" --nslist pid --exact "zb r1" | head -n 1; }
 driven 5 kill -KILL "$(gateway)"
 established && one_connection || fail "the robot's connection is lost"
-ok "a gateway is killed: $rest; the next process goes on with its connection"
+ok "gateway killed: $rest; the next process takes over its connection"
 before=$(main)
 driven 5 kill -KILL "$(supervisor)"
 robot
-established || fail "r1 is not back"
-[ "$(main)" != "$before" ] || fail "the container was not started again"
-ok "the supervisor is killed: $rest; the container is started again"
+established || fail "r1 is not established again"
+[ "$(main)" != "$before" ] || fail "the container was not restarted"
+ok "supervisor killed: $rest; the container was restarted"
 
 recorded() { podman exec "$recorder" sh -c 'find /var/lib/zbridge-recorder -name "*.mcap" -size +20k | grep .' 2>/dev/null; }
 within 30 recorded || fail "nothing is recorded"
 began=$SECONDS
 driven 10 podman-compose --file "$root/deploy/container/compose.yaml" stop
-[ $((SECONDS - began)) -lt 25 ] || fail "the end takes $((SECONDS - began)) s"
+[ $((SECONDS - began)) -lt 25 ] || fail "the stop took $((SECONDS - began)) s"
 file=$(find "$(podman volume inspect --format '{{.Mountpoint}}' zbridge_recordings)" -name '*.mcap' | sort | tail -n 1)
 zbridge info "$file" >info.log || { cat info.log; fail "zbridge info"; }
 grep --quiet r1 info.log || { cat info.log; fail "the recording"; }
 ! grep --ignore-case "cut off" info.log || fail "the recording is cut off"
-ok "the recorder finds the router by its name and records r1 over mutual TLS: $(du --block-size=1K "$file" | cut -f 1) kB, whole after a stop"
+ok "the recorder resolves the router by name and records r1 over mutual TLS: $(du --block-size=1K "$file" | cut -f 1) kB, complete after a stop"
 robot
-compose up -d --no-build || fail "podman-compose up, again"
+compose up -d --no-build || fail "second podman-compose up"
 established || fail "r1 is not established again"
 compose down || fail "podman-compose down"
 [ -z "$(podman ps --all --quiet)" ] || fail "containers are left"
-ok "stopped ($rest), started again, down"
+ok "composition stopped ($rest), started again, removed"

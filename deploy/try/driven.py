@@ -1,8 +1,8 @@
-"""Drives a robot, runs a command meanwhile, and tells after how long the robot was at rest, by its own account.
+"""Drives a robot, runs a command meanwhile, and reports when the robot had stopped, by the robot's own record.
 
-Usage: driven.py BUNDLE ROBOT ACCOUNT LIMIT_S COMMAND...; ACCOUNT is that of robot.py, BUNDLE an operator's. The driver
-drives on for as long as it may. Exit code 0: at rest within LIMIT_S seconds since the command began, and the command
-went well.
+Usage: driven.py BUNDLE ROBOT ACCOUNT LIMIT_S COMMAND...; ACCOUNT is the file that robot.py writes, BUNDLE an
+operator's. The driver drives until it loses the lease. Exit code 0: the robot stopped within LIMIT_S seconds of the
+command's start, and the command succeeded.
 """
 
 import asyncio
@@ -15,15 +15,15 @@ import zbridge
 from zbridge.errors import BusError, Refused
 
 MOVES_S = 20.0
-"""Longest time until the robot moves."""
+"""Longest wait until the robot moves."""
 REST_S = 1.0
-"""Time for which it must stay at rest."""
+"""Time for which it must stay stopped."""
 EVERY_S = 0.04
 COMMAND_S = 90.0
 
 
 async def drive_on(bundle: str, robot: str) -> None:
-    """Drive until the lease is lost; then do nothing more."""
+    """Drive until the lease is lost, then return."""
     with contextlib.suppress(Refused, BusError):
         async with zbridge.connect(tls=bundle) as fleet, fleet[robot].control() as drive:
             while True:
@@ -32,13 +32,13 @@ async def drive_on(bundle: str, robot: str) -> None:
 
 
 def last(account: Path) -> tuple[float, float]:
-    """Give the time of the last change, and the speed since."""
+    """Return the time of the last change, and the speed since."""
     rows = [line.split() for line in account.read_text().splitlines() if line[:1].isdigit()]
     return (float(rows[-1][0]), float(rows[-1][1])) if rows else (0.0, 0.0)
 
 
 async def moves(account: Path) -> bool:
-    """Wait until the robot moves; whether it does."""
+    """Wait until the robot moves; return whether it does."""
     until = time.monotonic() + MOVES_S
     while time.monotonic() < until:
         if last(account)[1]:
@@ -48,7 +48,7 @@ async def moves(account: Path) -> bool:
 
 
 async def rest_s(account: Path, since: float, limit_s: float) -> float | None:
-    """Wait until the robot stays at rest; give the seconds until then, None if it does not."""
+    """Wait until the robot stays stopped; return the seconds until it stopped, None if it did not."""
     while time.monotonic() < since + limit_s + REST_S:
         at, speed = last(account)
         if not speed and time.monotonic() - max(at, since) >= REST_S:
@@ -63,9 +63,9 @@ async def main(bundle: str, robot: str, path: str, limit: str, *command: str) ->
     driver = asyncio.create_task(drive_on(bundle, robot))
     try:
         if not await moves(account):
-            print(f"{robot} was never driven")
+            print(f"{robot} did not move within {MOVES_S:g} s")
             return 1
-        await asyncio.sleep(1.0)  # what the gateway deposits for its successor is a second old at most
+        await asyncio.sleep(1.0)  # the deposit for the gateway's successor is at most a second old
         since = time.monotonic()
         process = await asyncio.create_subprocess_exec(*command, stdout=sys.stderr)
         found = await rest_s(account, since, limit_s)
@@ -75,12 +75,12 @@ async def main(bundle: str, robot: str, path: str, limit: str, *command: str) ->
         driver.cancel()
         await asyncio.wait([driver])
     if found is None or found > limit_s:
-        print(f"{robot} is not at rest {limit_s:g} s after: {last(account)}")
+        print(f"{robot} did not stop within {limit_s:g} s; last change (time, speed): {last(account)}")
         return 1
     if code:
         print(f"exit code {code}: {' '.join(command)}")
         return 1
-    print(f"{robot} at rest after {found:.2f} s")
+    print(f"{robot} stopped after {found:.2f} s")
     return 0
 
 

@@ -1,4 +1,4 @@
-"""Waits until robots are established, as a viewer sees it over mutual TLS.
+"""Waits until robots are established, as seen by a viewer over mutual TLS.
 
 Usage: established.py BUNDLE ROBOT...
 """
@@ -13,14 +13,14 @@ WITHIN_S = 40.0
 
 
 async def all_established(bundle: str, names: list[str]) -> bool:
-    """Connect anew, for the router may just have been restarted; whether all robots are established now."""
+    """Return whether all robots are established. Reconnects, because the router may just have been restarted."""
     async with zbridge.connect(tls=bundle) as fleet:
         found = await fleet.robots()
     return all((status := found.get(name)) is not None and status.state == "established" for name in names)
 
 
 async def main(bundle: str, *names: str) -> int:
-    """Ask until all robots are established, or the time is over."""
+    """Poll until all robots are established, for WITHIN_S seconds at most; return the exit code."""
     told = ""
     try:
         async with asyncio.timeout(WITHIN_S):

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# install.sh on a bare Debian host: in a chroot without systemd and network, then on one that systemd booted (systemd-nspawn). Usage: host.sh FOLDER
+# Tests install.sh on a bare Debian host: in a chroot without systemd and network, then booted by systemd (systemd-nspawn). Usage: host.sh FOLDER
 # shellcheck source-path=SCRIPTDIR disable=SC2015
 source "$(dirname "${BASH_SOURCE[0]}")/common.sh"
 as_root
@@ -7,7 +7,7 @@ need mmdebstrap mmdebstrap
 need systemd-nspawn systemd-container
 wheel "$work/wheels" "${root}[certs,serial,foxglove]"
 
-other() { # VERSION: the wheel of another version; $work/VERSION has its code, to be changed before
+other() { # VERSION: builds the wheel of another version from the code in $work/VERSION
     sed -i "s/^version = .*/version = \"$1\"/" "$work/$1/pyproject.toml"
     wheel "$work/later-$1" --no-deps "$work/$1"
 }
@@ -15,7 +15,7 @@ for version in 0.1.1 0.1.2; do
     mkdir "$work/$version"
     cp -r "$root"/{pyproject.toml,README.md,LICENSE,zbridge,gateways} "$work/$version/"
 done
-# One that can be told from this one by what its gateways answer, and one whose gateways do not start.
+# 0.1.1 is recognized by what its gateways answer; the gateways of 0.1.2 do not start.
 sed -i 's/; version=0.0.4/; version=0.0.4; zbridge=0.1.1/' "$work/0.1.1/zbridge/app/prometheus.py"
 echo 'raise RuntimeError("a broken version")' >>"$work/0.1.2/zbridge/app/gateway.py"
 other 0.1.1
@@ -30,28 +30,28 @@ clean=(env -i PATH=/usr/local/bin:/usr/bin:/bin:/usr/sbin:/sbin HOME=/root)
 echo "-- a chroot"
 listing() { (cd "$host" && find . -path ./root -prune -o -path ./proc -prune -o -print | sort); }
 listing >"$work/before"
-install() { # ARGUMENTS: install.sh without a network
+install() { # ARGUMENTS: runs install.sh without a network
     unshare --net --mount --pid --fork --mount-proc="$host/proc" "${clean[@]}" chroot "$host" bash /root/try/deploy/install.sh "$@"
 }
 for round in first second; do
-    install --wheels /root/try/wheels --router --recorder >"$work/$round" 2>&1 || { cat "$work/$round"; fail "install.sh, $round time"; }
+    install --wheels /root/try/wheels --router --recorder >"$work/$round" 2>&1 || { cat "$work/$round"; fail "$round run of install.sh"; }
     listing >"$work/after-$round"
 done
-grep -q "wrote /etc/systemd/system/zbridge.service" "$work/first" || fail "the first time writes no unit"
-! grep "wrote" "$work/second" || fail "the second time writes something"
-diff "$work/after-first" "$work/after-second" || fail "the second time leaves other files"
+grep -q "wrote /etc/systemd/system/zbridge.service" "$work/first" || fail "the first run wrote no unit"
+! grep "wrote" "$work/second" || fail "the second run wrote files"
+diff "$work/after-first" "$work/after-second" || fail "the second run changed the set of files"
 "${clean[@]}" chroot "$host" zbridge check /dev/null >/dev/null 2>&1 || [ $? -eq 2 ] || fail "zbridge does not run"
 "${clean[@]}" chroot "$host" /opt/zbridge/bin/python -c 'import mcap, serial, cryptography' || fail "an extra is missing"
-ok "installs without a network; the second time changes nothing"
+ok "installs without a network; the second run changes nothing"
 install --uninstall >"$work/log" || { cat "$work/log"; fail "--uninstall"; }
-[ -d "$host/etc/zbridge/bus" ] && [ ! -e "$host/opt/zbridge" ] || fail "--uninstall removes too much, or too little"
-for round in first second; do install --uninstall --purge >"$work/log" || { cat "$work/log"; fail "--purge, $round time"; }; done
+[ -d "$host/etc/zbridge/bus" ] && [ ! -e "$host/opt/zbridge" ] || fail "--uninstall removed the configuration, or left /opt/zbridge"
+for round in first second; do install --uninstall --purge >"$work/log" || { cat "$work/log"; fail "$round run of --purge"; }; done
 listing | comm -13 "$work/before" - | grep -v -e '^./var/log' -e '^./etc/.*-$' -e '^./usr/lib/python3' -e '^./etc/sysusers.d$' >"$work/left" || true
-[ ! -s "$work/left" ] || { cat "$work/left"; fail "--uninstall --purge leaves files"; }
-ok "--uninstall keeps the configuration, --purge leaves nothing; a second time does no harm"
+[ ! -s "$work/left" ] || { cat "$work/left"; fail "--uninstall --purge left files"; }
+ok "--uninstall keeps the configuration, --purge leaves nothing; a second run does no harm"
 
 echo "-- a booted host, with a network of its own"
-ungroup() { # systemd-nspawn leaves the control groups behind that it made in that of its caller, and does not start where it finds half of them
+ungroup() { # removes the control groups that systemd-nspawn leaves in its caller's, because it does not start if some of them exist
     local controllers path group
     while IFS=: read -r _ controllers path; do
         case $controllers in
@@ -92,6 +92,6 @@ inside bash /root/try/deploy/try/inside.sh /root/try started failing upgraded ob
 inside systemctl reboot || true
 code=0
 wait "$nspawn" || code=$?
-[ $code -eq 133 ] || fail "systemd-nspawn ended with $code, not with 133, which says that the host wants to be booted again"
-boot || fail "the host does not boot again"
+[ $code -eq 133 ] || fail "systemd-nspawn exited with $code; expected 133, a request to boot again"
+boot || fail "the host did not boot again"
 inside bash /root/try/deploy/try/inside.sh /root/try booted removed

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Runs on the host that deploy/try/host.sh booted: a router with certificates, robots, and what happens to them. Usage: inside.sh FOLDER PART...
+# Tests a router with certificates and robots on the host that deploy/try/host.sh booted. Usage: inside.sh FOLDER PART...
 # shellcheck source-path=SCRIPTDIR disable=SC2015
 source "$(dirname "${BASH_SOURCE[0]}")/common.sh"
 cd "$work"
@@ -18,10 +18,10 @@ over() {
 declare -A robots=()
 trap 'over $?' EXIT
 
-robot() { # NAME PORT: what is as fragile as a deployed robot serves one connection a start; start it anew
+robot() { # NAME PORT: restarts a fragile robot, which serves one connection per start, as deployed ones do
     start_of "$1" /opt/zbridge/bin/python "$root/deploy/try/robot.py" "$2" "$work/$1.account"
 }
-start_of() { # NAME COMMAND...: no function, for a function would be a process of its own
+start_of() { # NAME COMMAND...: starts a command; not a function, which would run in a process of its own
     end_of "$1"
     "${@:2}" >/dev/null 2>&1 &
     robots[$1]=$!
@@ -29,10 +29,10 @@ start_of() { # NAME COMMAND...: no function, for a function would be a process o
 end_of() { # NAME
     [ -z "${robots[$1]:-}" ] || { kill "${robots[$1]}" 2>/dev/null || true; wait "${robots[$1]}" 2>/dev/null || true; }
 }
-one_connection() { # NAME: what the robot has to say since its start; what it puts down to its own lateness is left out
+one_connection() { # NAME: fails if the robot reported anything since its start, except faults caused by its own lateness
     ! grep -e '^violation' -e 'second connection' -e 'ended' "$work/$1.account" | grep -v '(this process'
 }
-driven() { # LIMIT_S COMMAND...: r1 is driven while the command runs, and must come to rest; tells after how long
+driven() { # LIMIT_S COMMAND...: drives r1 while the command runs; r1 must stop within LIMIT_S; sets rest to the time
     rest=$(python "$root/deploy/try/driven.py" "$work/ann" r1 "$work/r1.account" "$@" 2>"$work/driven.log") || { cat "$work/driven.log"; fail "$rest"; }
 }
 gateway() { pgrep --exact "zb $1" | head -n 1; }

@@ -1,7 +1,7 @@
-"""A robot as fragile as deployed ones, which tells what it was commanded: one connection a start, no fault forgiven.
+"""A robot as fragile as deployed ones, with a record of its commands: one connection per start, no fault tolerated.
 
-Usage: robot.py PORT ACCOUNT. Each line of the account is a time (monotonic seconds) and the commanded speed, or a word
-and what happened: ``event: second connection ...``, ``violation: ...``.
+Usage: robot.py PORT ACCOUNT. Each line of the file ACCOUNT is a time (monotonic seconds) and the commanded speed, or a
+word and what happened: ``event: second connection ...``, ``violation: ...``.
 """
 
 import asyncio
@@ -9,18 +9,20 @@ import math
 import struct
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from gateways.tcpudp.conformance.fragile_robot import FragileRobot
 
 
-class Telling(FragileRobot):
-    """Tells each change of what it was commanded."""
+class RecordingRobot(FragileRobot):
+    """Records each change of its commanded speed."""
 
     def __init__(self, account: Path) -> None:
         self._account, self._known = account.open("w", buffering=1), 0.0
-        super().__init__(version="1.3", udp=False, seed=1, client_id=2, note=lambda text: self.tell("violation:", text))
+        violated = partial(self.record, "violation:")
+        super().__init__(version="1.3", udp=False, seed=1, client_id=2, note=violated)
         steer = self.machine.steer
 
         def obey(body: bytes) -> None:
@@ -29,24 +31,24 @@ class Telling(FragileRobot):
             speed = math.hypot(*values[:2]) * values[2] if len(values) == 3 else sum(map(abs, values))
             if speed != self._known:
                 self._known = speed
-                self.tell(f"{time.monotonic():.3f}", f"{speed:.3g}")
+                self.record(f"{time.monotonic():.3f}", f"{speed:.3g}")
 
         self.machine.steer = obey  # type: ignore[method-assign]
 
-    def tell(self, *words: Any) -> None:
+    def record(self, *words: Any) -> None:
         """Write one line."""
         print(*words, file=self._account)
 
     def _event(self, text: str) -> None:
         super()._event(text)
-        self.tell("event:", text)
+        self.record("event:", text)
 
 
 async def main(port: str, account: str) -> None:
-    """Be a robot until killed, or dead."""
-    robot = Telling(Path(account))
-    await robot.serve("127.0.0.1", int(port), lambda _: robot.tell("event:", "listening"))
-    robot.tell("event:", "ended", robot.death)
+    """Simulate the robot until it is killed, or dies of a fault."""
+    robot = RecordingRobot(Path(account))
+    await robot.serve("127.0.0.1", int(port), lambda _: robot.record("event:", "listening"))
+    robot.record("event:", "ended", robot.death)
 
 
 asyncio.run(main(*sys.argv[1:]))

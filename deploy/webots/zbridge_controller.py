@@ -1,8 +1,8 @@
 """A Webots controller that puts its robot on a TCP port, in the deployed dialect of WC2EC, for `zbridge run`.
 
 Needs nothing but Python and Webots' own `controller` module. In the simulation: controller "zbridge_controller",
-controllerArgs ["27015"] (one port per robot; 27015 without arguments). It serves one gateway at a time and listens
-again when that one goes; meanwhile the motors stand. See README.md beside this file.
+controllerArgs ["27015"] (one port per robot; 27015 without arguments). It serves one gateway at a time. When the
+gateway disconnects, it stops the motors and listens again. See README.md beside this file.
 """
 
 import socket
@@ -19,7 +19,7 @@ COMMAND_BYTES = 11
 
 
 class Bridge:
-    """One robot's devices, and the gateway that is connected to it, if any."""
+    """One robot's devices, and the connected gateway, if any."""
 
     def __init__(self, robot, port):
         self.robot = robot
@@ -33,10 +33,10 @@ class Bridge:
         self.gateway = None
         self.received = b""
         self.unsent = b""
-        self.stand()
+        self.stop()
 
-    def stand(self):
-        """Let every rotational motor stand; linear ones hold their position."""
+    def stop(self):
+        """Stop every rotational motor; linear ones hold their position."""
         for motor in self.motors.values():
             if motor.getType() == Node.ROTATIONAL_MOTOR:
                 motor.setPosition(float("inf"))
@@ -49,7 +49,7 @@ class Bridge:
             return
         try:
             self.receive()
-            if not self.unsent:  # a gateway that reads slowly misses readings, not parts of them
+            if not self.unsent:  # a gateway that reads slowly misses whole readings, never parts of one
                 self.unsent = b"".join(self.readings())
             self.send()
         except OSError:
@@ -68,7 +68,7 @@ class Bridge:
     def leave(self):
         self.gateway.close()
         self.gateway = None
-        self.stand()
+        self.stop()
 
     def registrations(self):
         for number, device in enumerate(self.devices):
@@ -85,13 +85,13 @@ class Bridge:
         except BlockingIOError:
             return
         if not data:
-            raise ConnectionError("the gateway went")
+            raise ConnectionError("the gateway disconnected")
         self.received += data
         while len(self.received) >= COMMAND_BYTES:
             command, _, number, value = struct.unpack_from("<BBBd", self.received)
             self.received = self.received[COMMAND_BYTES:]
             if command != SET_VALUE:
-                raise ConnectionError(f"command {command}: nothing tells how long it is")
+                raise ConnectionError(f"unknown command {command}: its length is unknown")
             self.set(number, value)
 
     def set(self, number, value):

@@ -12,6 +12,7 @@ import pytest
 from zbridge.app import Plan, plan
 from zbridge.app.gateway import Gateway, Neighbourhood
 from zbridge.app.host import HostSettings
+from zbridge.app.joining import RECONNECTS_S, STUCK_S
 from zbridge.app.together import LONGEST_PAUSE_S, Together
 from zbridge.bus import Bus
 from zbridge.bus.fake import FakeBus
@@ -20,10 +21,11 @@ from zbridge.errors import LinkError
 pytestmark = pytest.mark.jumping
 
 NAMES = ("r1", "r2", "r3")
+DEVICE = {"protocol": "tcpudp", "connect": ["tcp://127.0.0.1:1"]}
 
 
 def planned(name: str) -> Plan:
-    return plan({"robot": {"name": name}, "device": {"protocol": "tcpudp", "connect": ["tcp://127.0.0.1:1"]}})
+    return plan({"robot": {"name": name}, "device": DEVICE})
 
 
 class Played:
@@ -127,3 +129,30 @@ async def test_one_robot_is_stopped_and_started_again_while_the_others_stay(monk
             served.start("r2", planned("r2"))
         await asyncio.sleep(0.1)
         assert len(await watch.alive("fleet/*/@alive/gateway")) == 3
+
+
+async def test_all_robots_move_to_a_new_session_where_the_first_one_does_not_connect_again(
+    monkeypatch, played: Played
+) -> None:
+    opened: list[FakeBus] = []
+
+    async def open_bus(*_: object, **__: object) -> Bus:
+        opened.append(FakeBus(f"{len(opened)}"))
+        return opened[-1]
+
+    monkeypatch.setattr("zbridge.app.joining.open_bus", open_bus)
+    bus = {"connect": ["tcp/127.0.0.1:1"]}
+    plans = {name: plan({"robot": {"name": name}, "device": DEVICE, "bus": bus}) for name in NAMES}
+    running = asyncio.create_task(
+        Together(plans, HostSettings(together=True), lambda plan: contextlib.nullcontext()).run()
+    )
+    await asyncio.sleep(10.0)
+    opened[0].connection(False)
+    await asyncio.sleep(STUCK_S + RECONNECTS_S + 10.0)
+    assert len(opened) == 3, "the first, one to try, and the new one"
+    assert sorted(played.ended) == sorted(NAMES)
+    assert [await opened[-1].alive(f"fleet/{name}/@alive/gateway") for name in NAMES] == [
+        [f"fleet/{name}/@alive/gateway"] for name in NAMES
+    ]
+    running.cancel()
+    await asyncio.wait([running])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
 
 import pytest
@@ -134,3 +135,13 @@ async def test_what_may_move_a_robot_by_itself_is_noted(command: FleetMessage, m
     rig = Rig()
     rig.enforcer.commanded(command)
     assert rig.authority.moving is moves
+
+
+async def test_after_its_end_nothing_that_still_arrives_sets_a_timer() -> None:
+    scene = Rig()
+    scene.enforcer.close()
+    scene.shown.clear()
+    scene.enforcer.refuse("drive", NeutralFirst("the gateway has ended"), "a")
+    scene.enforcer.settle()
+    await asyncio.sleep(0.2)
+    assert scene.shown == []

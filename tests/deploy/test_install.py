@@ -20,8 +20,8 @@ def install(*arguments: str) -> subprocess.CompletedProcess[str]:
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (("--purge",), "--purge: expected --uninstall with it"),
-        (("--nonsense",), "--nonsense: unknown"),
+        (("--purge",), "--purge: requires --uninstall"),
+        (("--nonsense",), "--nonsense: unknown option"),
         (("--wheels",), "--wheels: expected a path"),
     ],
 )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from zbridge.hq.freeze import CATCH_UP_S, FROZEN_S, FreezeWatch
 
 
@@ -26,3 +28,18 @@ def test_input_after_a_freeze_is_stale_until_the_queue_is_read_and_the_freeze_is
     assert frozen == [4.0]
     assert watch.stale(20.0)
     assert len(frozen) == 2
+
+
+def test_a_suspended_machine_is_a_freeze_although_the_time_of_the_loop_stood_still() -> None:
+    frozen: list[float] = []
+    suspended = [3.0]
+    watch = FreezeWatch(10.0, frozen.append, lambda: suspended[0])
+    watch.beat(10.2)
+    assert frozen == [], "what was before it began is not counted"
+    suspended[0] += 2.0
+    assert watch.stale(10.25)
+    assert frozen == [pytest.approx(2.05)]
+    assert watch.stale(10.25 + CATCH_UP_S / 2)
+    assert not watch.stale(10.25 + CATCH_UP_S)
+    watch.beat(10.7)
+    assert len(frozen) == 1

@@ -82,6 +82,10 @@ class Grant:
         if self.ended_at is None:
             self.ended_at, self.why = now, why
 
+    def expires_by(self, now: float) -> bool:
+        """Whether it has expired by its gateway's clock, which may be a little fast, unless that renewed it."""
+        return now > self.renewed_at + 0.999 * self.lease_s - 0.01
+
     def over(self, now: float, slack_s: float) -> bool:
         """Whether it ended more than so long ago."""
         return self.ended_at is not None and now > self.ended_at + slack_s

@@ -7,11 +7,11 @@ Each violation begins with its time and the name of its rule.
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from typing import TYPE_CHECKING, Any
 
 from tests.simulated.accounts import MAX_AGE_S, TOLERANCE, Command, Grant, motions, read
-from tests.simulated.obligations import Obligations
+from tests.simulated.obligations import LEFT, Obligations
 from tests.simulated.released import Released
 from tests.simulated.shown import Shown
 from tests.simulated.written import Written
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 SLACK_S = 0.06
 """What is on its way through a gateway when a lease ends may be written so long."""
+NEW = "+"
+"""Behind the name of a gateway's successor, until *go*."""
 WRITTEN_S = 0.02
 """Seconds that writing a latched stop takes."""
 KNOWN_S = 8.0
@@ -47,6 +49,10 @@ class Checker:
         self.current: dict[str, Grant] = {}
         """By gateway, the lease that it granted last."""
         self.latches: dict[str, dict[bytes, float]] = {each.name: {} for each in simulation.gateways}
+        self.uncertain: set[bytes] = set()
+        """Latched stops of which a gateway may know and another one not: it was killed, or has not taken over."""
+        self._before_go: defaultdict[str, set[bytes]] = defaultdict(set)
+        """By gateway, the latched stops that a successor received."""
         self.gateways = {each.name: each for each in simulation.gateways}
         self.by_host = {each.host.name: each.name for each in simulation.gateways if each.serves}
         self._requests: dict[tuple[str, str], dict[str, Any]] = {}
@@ -69,6 +75,8 @@ class Checker:
             "writes": self._on_writes,
             "sends": self._on_sends,
             "alive": self._on_alive,
+            "withdraws": self._on_withdraws,
+            "took over": self._on_took_over,
             "connected": self._on_connected,
             "started": self._on_started,
             "killed": self._on_ended,
@@ -118,11 +126,11 @@ class Checker:
                 known.pop(request.get("id", b""), None)
         elif answer.get("ok") and verb in ("acquire", "takeover"):
             grant, last = Grant(gateway, asker, answer, request, self.world.now), self.current.get(gateway)
-            stands = last is not None and last.ended_at is None and last.shown
+            stands = last is not None and last.ended_at is None and last.shown and not last.expires_by(self.world.now)
             again = last is not None and last.asks_again(asker, request)
             if verb == "acquire" and stands and not again and not request.get("priority"):
                 self.violate("held", f"{grant} granted while {last} stands")
-            self._grant(grant, request)
+            self._grant(grant, request, again=again)
         elif verb == "release" and gateway in self.current:
             if request.get("lease") == self.current[gateway].lease:
                 self._released(self.current[gateway], answer, asker)
@@ -138,12 +146,12 @@ class Checker:
         if answer.get("ok"):
             self.end(grant.gateway, "released")
 
-    def _grant(self, grant: Grant, request: dict[str, Any]) -> None:
+    def _grant(self, grant: Grant, request: dict[str, Any], *, again: bool) -> None:
         now = self.world.now
         most_s = self.simulation.scenario.get("control", {}).get("deadman_s", 2.0)
         grant.deadman_s = min(request.get("deadman_s") or most_s, most_s)
         grant.base_s = now - request.get("asked at", now)
-        self.end(grant.gateway, "superseded")
+        self.end(grant.gateway, "granted again" if again else "superseded")
         self._neutral_between(self._taken_at.pop(grant.who, None), grant)
         self.grants[grant.lease] = self.current[grant.gateway] = grant
         if any(now - at > SLACK_S for at in self.latches[grant.gateway].values()):
@@ -183,6 +191,15 @@ class Checker:
         if not alive and grant is not None and grant.alive and key.endswith(f"/@alive/{grant.alive}"):
             self.end(who, "holder lost")
 
+    def _on_withdraws(self, who: str, key: str) -> None:
+        if who in self.gateways and key.endswith("/@alive/gateway"):
+            self.end(who, LEFT)
+
+    def _on_took_over(self, who: str, why: str) -> None:
+        """What a successor received before *go* holds from now on."""
+        for stop_id in self._before_go.pop(who, ()):
+            self.latches[who].setdefault(stop_id, self.world.now)
+
     def _on_connected(self, who: str, up: Any) -> None:
         if up is False and who in self.gateways:
             self.end(who, "bus lost")
@@ -196,6 +213,7 @@ class Checker:
             unwritten = [each for each, at in self.latches[who].items() if self.world.now - at < WRITTEN_S]
             for stop_id in unwritten:  # nobody has confirmed it yet
                 del self.latches[who][stop_id]
+                self.uncertain.add(stop_id)
                 self.counts["excused: killed before a latch was written"] += 1
             self.end(who, "gateway ended")
 
@@ -280,10 +298,14 @@ class Checker:
 
     def _on_receives(self, gateway: str, key: str, payload: bytes, attachment: bytes | None) -> None:
         now = self.world.now
+        if key.endswith("@cmd/stop"):
+            fields = read(payload)
+            if gateway.endswith(NEW) and fields.get("latch") is True and fields.get("id"):
+                self._before_go[gateway.removesuffix(NEW)].add(fields["id"])
+                self.uncertain.add(fields["id"])
         if gateway not in self.gateways:
             return
         if key.endswith("@cmd/stop"):
-            fields = read(payload)
             self.end(gateway, "stop")
             if fields.get("latch") is True and fields.get("id"):
                 self.latches[gateway].setdefault(fields["id"], now)

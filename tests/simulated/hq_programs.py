@@ -51,6 +51,7 @@ class HqProgram(Process):
             end.on_close = lambda error: self.after(0.0, lambda: self.lost(end))
             self.world.note(self.name, "connected to listener")
             self.greet(end)
+            end.on_data()  # the listener may have spoken first
 
         def given_up() -> None:
             if self.end is None and number == self._connection:
@@ -175,11 +176,13 @@ class TcpUdpHq(HqProgram):
             flags = bytes([self.udp, 0, 1, 0, 0, 0, 0])
             self.send(3, struct.pack("<i", len(versions)) + versions + flags)
             if not self.udp:
-                self.after(0.2, self.established)
+                connection = self._connection
+                self.after(0.2, lambda: self.established() if connection == self._connection else None)
         elif kind == 4 and self.udp:
             source = (self.host.name, 11000)
             self.network.datagram(source, self.address, _PACKET.pack(2, self._id, 5))
-            self.after(2.0, lambda: None if self.ready else self.confirm())
+            connection = self._connection
+            self.after(2.0, lambda: self.confirm() if connection == self._connection else None)
 
     def datagram(self, data: bytes) -> None:
         """Take a datagram."""

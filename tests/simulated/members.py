@@ -94,8 +94,8 @@ class Member:
         raise NotImplementedError
 
     def stop(self) -> None:
-        """End it in order, as SIGTERM does."""
-        if self.alive:
+        """End it in order, as SIGTERM does; a second one changes nothing."""
+        if self.alive and not self.ending:
             assert self.process.loop is not None
             assert self.task is not None
             self.ending = True

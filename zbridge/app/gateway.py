@@ -21,7 +21,7 @@ import msgspec
 from zbridge.app.audit import open_audit
 from zbridge.app.config import Plan
 from zbridge.app.handover import ClaimPart, Incoming, Restarts, Successor
-from zbridge.app.joining import CertificateEnded, watch_certificate
+from zbridge.app.joining import SessionUseless, watch_certificate, watch_session
 from zbridge.app.prometheus import serve_metrics
 from zbridge.app.runtime import RUNTIME, Runtime
 from zbridge.app.serving import SERVED_ELSEWHERE, Begin, Serving
@@ -126,7 +126,7 @@ class Gateway:
                 try:
                     await self._run(bus, audit)
                     return
-                except CertificateEnded as error:
+                except SessionUseless as error:
                     self._incoming = None
                     log.error("%s", error)
                 except Exception as error:
@@ -145,9 +145,10 @@ class Gateway:
         """
         self._neighbourhood = neighbourhood
         with open_audit(self._plan, self.metrics, self.conditions) as audit:
-            await self._run(bus, audit, metrics=False)
+            await self._run(bus, audit, alone=False)
 
-    async def _run(self, bus: Bus, audit: Audit, *, metrics: bool = True) -> None:
+    async def _run(self, bus: Bus, audit: Audit, *, alone: bool = True) -> None:
+        """Run all parts. alone: the bus and the metrics are this gateway's own."""
         if self._incoming is not None:
             await self._incoming.receive()
         async with contextlib.AsyncExitStack() as stack:
@@ -167,8 +168,10 @@ class Gateway:
                 work.append(self._robot(bus, audit, self._plan.device))
             else:
                 stack.callback(self._show_sessions(bus, self._process).close)
-            if metrics and self._plan.metrics is not None:
+            if alone and self._plan.metrics is not None:
                 work.append(self._serve_metrics(self._plan.metrics))
+            if alone and self._plan.config.bus.effective_mode == "client":
+                work.append(watch_session(self._plan, bus, self._runtime.can_connect))
             await until(self.restarts.gone, together(*work, first=self.restarts.settle))
 
     async def _serve_metrics(self, address: Address) -> None:
@@ -198,6 +201,7 @@ class Gateway:
                 each,
                 self._runtime.raw_ms,
                 self._runtime.kernel,
+                self._runtime.suspended_s,
             )
             for plan, name, each in zip(plans, names, given, strict=True)
         ]

@@ -1,16 +1,20 @@
-"""A gateway joins the bus, and again until that succeeds; its certificate is warned of, and the bus left at its end.
+"""A gateway joins the bus, and again until that succeeds; it leaves a session that is of no use any more.
 
 Zenoh's session would knock with an expired certificate every 4 s for good, and each time the router accepts nobody for
 0.1 s. So a gateway whose certificate has expired leaves, and tries rarely, with the file as it is then.
+
+After a cut of the network a session of Zenoh 1.10 may never connect again (eclipse-zenoh/zenoh#1876). A gateway that
+has no connection for long therefore tries with a second session, and leaves the first one where only that one connects.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import itertools
 import logging
 import random
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from datetime import datetime
 
 from zbridge.app.config import Plan
@@ -39,11 +43,19 @@ SAY_S = 86_400.0
 """Seconds between log lines about the certificate's end."""
 ENDED_S = 5.0
 """Seconds between looks after the certificate's end: at the next one without a bus the gateway leaves."""
+STUCK_S = 15.0
+"""Seconds without a connection after which a second session is tried, every time; Zenoh itself tries every 4 s."""
+RECONNECTS_S = 10.0
+"""Seconds within which a session connects, once another one can."""
 _CERTIFICATE = "certificate"
 
 
-class CertificateEnded(BusError):
-    """The certificate has expired and the bus is lost: this session will not get it back."""
+class SessionUseless(BusError):
+    """This session will not connect again: it is left, and the bus joined with a new one."""
+
+
+class CertificateEnded(SessionUseless):
+    """The certificate has expired and the bus is lost."""
 
 
 class Pauses:
@@ -97,6 +109,42 @@ async def join_bus(plan: Plan, metrics: Metrics) -> Bus:
             log.warning("no bus: %s; next attempt in %.2g s", error, pause)
             await asyncio.sleep(pause)
     raise AssertionError("it tries for ever")
+
+
+async def can_connect(plan: Plan) -> bool:
+    """Whether a new session connects to the bus; it is closed again."""
+    try:
+        bus = await open_bus(plan.config.bus, Metrics(), within_s=OPEN_S, explain=False)
+    except BusError:
+        return False
+    await bus.close()
+    return True
+
+
+async def watch_session(plan: Plan, bus: Bus, can_connect: Callable[[Plan], Awaitable[bool]]) -> None:
+    """Raise SessionUseless where a client's session does not connect again, and a new one does."""
+    changed, here = asyncio.Event(), False
+
+    def connected(is_here: bool) -> None:
+        nonlocal here
+        here = is_here
+        changed.set()
+
+    async def returns(within_s: float) -> bool:
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(within_s):
+                while not here:
+                    changed.clear()
+                    await changed.wait()
+        return here
+
+    bus.watch_connected(connected)
+    while True:
+        while here:
+            changed.clear()
+            await changed.wait()
+        if not await returns(STUCK_S) and await can_connect(plan) and not await returns(RECONNECTS_S):
+            raise SessionUseless("Zenoh's session does not connect again, and a new one does: the bus is joined anew")
 
 
 async def watch_certificate(

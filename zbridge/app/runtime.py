@@ -15,7 +15,7 @@ import msgspec
 
 from zbridge.app.config import Plan
 from zbridge.app.handover.processes import PROCESSES, Processes
-from zbridge.app.joining import join_bus
+from zbridge.app.joining import can_connect, join_bus
 from zbridge.bus import Bus
 from zbridge.control import clocks
 from zbridge.metrics import Metrics
@@ -28,7 +28,7 @@ class Runtime(msgspec.Struct, frozen=True):
     clock: seconds on the time line of event loops, without their rounding. clock_ns: Unix time. raw_ms, suspended_s:
     see :mod:`zbridge.control.clocks`. chance: 0 to 1. secret: so many random bytes. folder: where latched stops are
     kept; None: where :func:`zbridge.control.latch_store.state_folder` says. processes: for a restart. join: opens the
-    bus, however long that takes.
+    bus, however long that takes. can_connect: whether a second session connects to it.
     """
 
     clock: Callable[[], float] = time.monotonic
@@ -41,6 +41,7 @@ class Runtime(msgspec.Struct, frozen=True):
     folder: Path | None = None
     processes: Processes = PROCESSES
     join: Callable[[Plan, Metrics], Awaitable[Bus]] = join_bus
+    can_connect: Callable[[Plan], Awaitable[bool]] = can_connect
 
 
 RUNTIME = Runtime()

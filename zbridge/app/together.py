@@ -14,14 +14,16 @@ import contextlib
 import logging
 import random
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Coroutine, Mapping
+from typing import Any
 
 from zbridge.app.addresses import hold_addresses
 from zbridge.app.config import Plan
 from zbridge.app.gateway import Gateway, Neighbourhood
 from zbridge.app.host import HostSettings
-from zbridge.app.joining import CertificateEnded, join_bus, watch_certificate
+from zbridge.app.joining import SessionUseless, can_connect, join_bus, watch_certificate, watch_session
 from zbridge.app.prometheus import serve_metrics
+from zbridge.app.tasks import together
 from zbridge.bus import Bus
 from zbridge.bus.tls.files import own_certificate
 from zbridge.control.conditions import Conditions
@@ -72,14 +74,17 @@ class Together:
             self._bus = await join_bus(next(iter(self._plans.values())), self.metrics)
             try:
                 await self._serve(self._bus)
-            except CertificateEnded as error:
+            except SessionUseless as error:
                 log.error("%s", error)
             finally:
                 self.left = await self._bus.close()
 
     async def _serve(self, bus: Bus) -> None:
-        """Run all gateways; raise CertificateEnded when the session is of no use any more."""
-        certificate = own_certificate(next(iter(self._plans.values())).config.bus.tls)
+        """Run all gateways; raise SessionUseless when the session is of no use any more."""
+        any_plan = next(iter(self._plans.values()))
+        settings = any_plan.config.bus
+        certificate = own_certificate(settings.tls)
+        watches: list[Coroutine[Any, Any, None]] = []
         async with contextlib.AsyncExitStack() as stack:
             for address in {plan.metrics for plan in self._plans.values() if plan.metrics is not None}:
                 await stack.enter_async_context(serve_metrics(address, self.metrics))
@@ -87,7 +92,11 @@ class Together:
             for number, (name, plan) in enumerate(self._plans.items()):
                 self.start(name, plan, (number + random.random()) * self._host.stagger_s)
             if certificate is not None:
-                await watch_certificate(certificate, bus, Conditions())
+                watches.append(watch_certificate(certificate, bus, Conditions()))
+            if settings.effective_mode == "client":
+                watches.append(watch_session(any_plan, bus, can_connect))
+            if watches:
+                await together(*watches)
             await asyncio.Event().wait()
 
     def start(self, name: str, plan: Plan, after_s: float = 0.0) -> None:

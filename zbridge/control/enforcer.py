@@ -77,6 +77,7 @@ class Enforcer:
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at = math.inf
         self._control_due: asyncio.TimerHandle | None = None
+        self._closed = False
         self._refused = context.metrics.count("refused")
         self._same_stops = context.metrics.count("stops_folded")
         self._slowed = context.metrics.count("drives_slowed")
@@ -231,7 +232,8 @@ class Enforcer:
         self._context.publish(topics.CONTROL, self.authority.report(self._clock()))
 
     def close(self) -> None:
-        """Let no timer fire any more."""
+        """Let no timer fire any more, nor be set by what still arrives."""
+        self._closed = True
         for timer in (self._timer, self._control_due):
             if timer is not None:
                 timer.cancel()
@@ -242,7 +244,7 @@ class Enforcer:
             for event in events:
                 changed = changed or event.what is not EventKind.REFUSED
                 self._carry_out(event)
-            if self._control_due is None:
+            if self._control_due is None and not self._closed:
                 self._control_due = self._loop.call_later(_CONTROL_S, self.report)
         if changed:
             self.report()

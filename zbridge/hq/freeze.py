@@ -13,10 +13,16 @@ FROZEN = "the gateway was frozen"
 
 
 class FreezeWatch:
-    """Watches the beats of an event loop. ``frozen`` is called with the seconds that a freeze lasted, once for each."""
+    """Watches the beats of an event loop. ``frozen`` is called with the seconds that a freeze lasted, once for each.
 
-    def __init__(self, now: float, frozen: Callable[[float], None]) -> None:
-        self._beat_at = now
+    suspended_s: seconds for which the machine was suspended so far, which the time of the loop does not count.
+    """
+
+    def __init__(
+        self, now: float, frozen: Callable[[float], None], suspended_s: Callable[[], float] = lambda: 0.0
+    ) -> None:
+        self._suspended_s = suspended_s
+        self._beat_at = now + suspended_s()
         self._stale_until = -math.inf
         self._frozen = frozen
 
@@ -25,17 +31,18 @@ class FreezeWatch:
 
     def begin(self, now: float) -> None:
         """Watch from now on; earlier time is not counted."""
-        self._beat_at = now
+        self._beat_at = now + self._suspended_s()
 
     def beat(self, now: float) -> None:
         """Record that the event loop runs; call it several times within :data:`FROZEN_S`."""
         self.stale(now)
-        self._beat_at = now
+        self.begin(now)
 
     def stale(self, now: float) -> bool:
         """Return True just after a freeze: input may have been queued meanwhile and must not cause motion."""
-        frozen_s = now - self._beat_at
+        frozen_s = now + self._suspended_s() - self._beat_at
         if frozen_s >= FROZEN_S:
-            self._beat_at, self._stale_until = now, now + CATCH_UP_S
+            self.begin(now)
+            self._stale_until = now + CATCH_UP_S
             self._frozen(frozen_s)
         return now < self._stale_until

@@ -13,7 +13,7 @@ import logging
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from zbridge.control.clocks import raw_ms
+from zbridge.control.clocks import raw_ms, suspended_s
 from zbridge.hq.admission import FULL, Admission
 from zbridge.hq.bridge import Bridge
 from zbridge.hq.broadcast import Broadcast
@@ -47,7 +47,7 @@ class Listener:
 
     name: of the listener on the bus. clock: seconds on the event loop's time line, by default the loop's own.
     given: the listener as another process handed it over, and its sockets. clock_ms: the raw clock, which dates
-    commands. kernel: of this machine, or a simulated one.
+    commands. kernel: of this machine, or a simulated one. suspended_s: for how long the machine was suspended so far.
     """
 
     def __init__(
@@ -61,8 +61,10 @@ class Listener:
         given: tuple[Exported, Parcel] | None = None,
         clock_ms: Callable[[], float] = raw_ms,
         kernel: Kernel = KERNEL,
+        suspended_s: Callable[[], float] = suspended_s,
     ) -> None:
         self._given = given
+        self._suspended_s = suspended_s
         self._clock_ms = clock_ms
         self.name = name
         self.address = plan.address
@@ -136,7 +138,7 @@ class Listener:
             counts=counts,
             connections=ConnectionLog(self.name),
             failures=FailureLog(self.name, counts.left_out),
-            freeze=FreezeWatch(self._clock(), self._on_freeze),
+            freeze=FreezeWatch(self._clock(), self._on_freeze, self._suspended_s),
             clock=self._clock,
             clock_ms=self._clock_ms,
             limits=Limits(

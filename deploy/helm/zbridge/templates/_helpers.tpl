@@ -3,7 +3,7 @@
 {{- printf "%s-%s" (.root.Release.Name | trunc 30 | trimSuffix "-") .part -}}
 {{- end -}}
 
-{{/* The name of a robot's objects. Names of the bus that Kubernetes cannot have get a part of their hash. */}}
+{{/* The name of a robot's objects. Names that are invalid in Kubernetes get part of their hash. */}}
 {{- define "zbridge.robot" -}}
 {{- $plain := regexReplaceAll "[^a-z0-9]+" (lower .robot) "-" | trimAll "-" -}}
 {{- if or (ne $plain .robot) (gt (len $plain) 24) -}}
@@ -29,7 +29,7 @@ helm.sh/chart: {{ printf "%s-%s" .root.Chart.Name .root.Chart.Version }}
 {{ printf "%s:%s" .Values.image.repository (.Values.image.tag | default .Chart.AppVersion) }}
 {{- end -}}
 
-{{/* What every pod is: no right that it does not need, no token of the cluster. */}}
+{{/* Every pod: no permission that it does not need, no token of the cluster. */}}
 {{- define "zbridge.pod" -}}
 automountServiceAccountToken: false
 enableServiceLinks: false
@@ -73,7 +73,7 @@ tolerations: {{- toYaml . | nindent 2 }}
 {{- else if .Values.router.enabled -}}
 {{- list (printf "tls/%s:7447" (include "zbridge.name" (dict "root" . "part" "router"))) | toJson -}}
 {{- else -}}
-{{- fail "bus.connect: missing, it is required where router.enabled is false" -}}
+{{- fail "bus.connect: missing; it is required if router.enabled is false" -}}
 {{- end -}}
 {{- end -}}
 
@@ -83,7 +83,7 @@ tolerations: {{- toYaml . | nindent 2 }}
     - {port: 53, protocol: TCP}
 {{- end -}}
 
-{{/* A rule to what is at the other end of the bus. */}}
+{{/* An egress rule to the routers of the bus. */}}
 {{- define "zbridge.toBus" }}
 {{- if .Values.bus.connect }}
 {{- range .Values.networkPolicy.routerTo }}
@@ -97,7 +97,7 @@ tolerations: {{- toYaml . | nindent 2 }}
 {{- end }}
 {{- end -}}
 
-{{/* A value in TOML. Whole numbers stay whole, which toToml of YAML values does not keep. */}}
+{{/* A value in TOML. Integers stay integers, unlike with toToml of YAML values. */}}
 {{- define "zbridge.value" -}}
 {{- if kindIs "map" . -}}
 {{- $parts := list -}}
@@ -114,7 +114,7 @@ tolerations: {{- toYaml . | nindent 2 }}
 {{- end -}}
 {{- end -}}
 
-{{/* A file in TOML: what is no table, then the tables. */}}
+{{/* A file in TOML: first the plain keys, then the tables. */}}
 {{- define "zbridge.toml" -}}
 {{- range $key, $value := . -}}
 {{- if not (kindIs "map" $value) }}

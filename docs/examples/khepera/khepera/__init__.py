@@ -17,7 +17,7 @@ track_m = 0.053                         # between the wheels
 
 
 async def _simulate(simulation: Simulation) -> None:
-    from khepera.simulator import simulate  # here: only a simulation needs sockets
+    from khepera.simulator import simulate  # imported here: only a simulation needs sockets
 
     await simulate(simulation)
 

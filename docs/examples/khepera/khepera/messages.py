@@ -43,7 +43,7 @@ class ReadPositions(Line, frozen=True):
 
 
 class Positions(Line, frozen=True):
-    """What the wheels have turned: 1 is 0.08 mm on the ground."""
+    """How far the wheels have turned: 1 is 0.08 mm on the ground."""
 
     word = b"h"
     left: I32

@@ -9,7 +9,7 @@ _POLLS = {"positions": ReadPositions(), "speeds": ReadSpeeds(), "proximity": Rea
 
 
 class KheperaSession(ExchangeSession[Line]):
-    """We ask, the robot answers."""
+    """The gateway sends requests, the robot answers."""
 
     role = Role.HQ
     frame_end, encode, read = staticmethod(LINES.end), staticmethod(LINES.write), staticmethod(LINES.read)

@@ -1,4 +1,4 @@
-"""A simulated Khepera in the simulated room: it answers lines, turns its wheels, and stands when nobody asks."""
+"""A simulated Khepera in the simulated room: it answers requests, turns its wheels, and stops during a silence."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from zbridge.wire import Line
 
 STEP_S = 0.01
 SILENCE_S = 1.0
-"""Seconds without a request after which it stands."""
+"""Seconds without a request after which it stops."""
 TRACK_M, RADIUS_M = 0.053, 0.0275
 _ANGLES = np.radians(list(BEARINGS_DEG.values()))
 
 
 class Khepera:
-    """The robot; knows no link."""
+    """The robot, without a link."""
 
     def __init__(self) -> None:
         self.body = Body(radius=RADIUS_M)
@@ -45,7 +45,7 @@ class Khepera:
         self._silent_s = 0.0
 
     def answer(self, line: bytes) -> bytes:
-        """Obey one line and answer it; nothing is the answer to what is no request."""
+        """Carry out one line and return its answer, empty for a line that is no request."""
         try:
             request = LINES.read(line)
         except ProtocolError:
@@ -55,7 +55,7 @@ class Khepera:
         return b"" if answer is None else LINES.write(answer)
 
     def step(self, dt: float) -> None:
-        """Live for ``dt`` seconds."""
+        """Advance by ``dt`` seconds."""
         self._silent_s += dt
         if self._silent_s > SILENCE_S:
             self.speeds = SetSpeeds(0, 0)
@@ -76,14 +76,14 @@ class Khepera:
             case ReadPositions():
                 return Positions(round(self._left_m / PULSE_M), round(self._right_m / PULSE_M))
             case ReadProximity():
-                return self._look()
+                return self._proximity()
             case SetLed():
                 was_on = self.leds.get(request.number, False)
                 self.leds[request.number] = request.action == 1 or (request.action == 2 and not was_on)
                 return LedSet()
         return None
 
-    def _look(self) -> Proximity:
+    def _proximity(self) -> Proximity:
         metres = cast(self.body.x, self.body.y, self.body.heading + _ANGLES, 1.0) - RADIUS_M
         light = np.interp(metres, DISTANCE_M[::-1], LIGHT[::-1], right=0)
         return Proximity(*(math.floor(value) for value in light))
@@ -92,7 +92,7 @@ class Khepera:
 async def simulate(simulation: Simulation) -> None:
     """Serve one Khepera on a TCP port until cancelled."""
     if simulation.version or simulation.dialect or simulation.udp or simulation.fragile:
-        raise ConfigError("a Khepera has no versions, dialects or datagrams, and no fragile robot")
+        raise ConfigError("a simulated Khepera has no versions, dialects, datagrams or fragile variant")
     robot = Khepera()
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -100,7 +100,7 @@ async def simulate(simulation: Simulation) -> None:
             while line := await reader.readline():
                 writer.write(robot.answer(line))
                 await writer.drain()
-        except (ConnectionError, ValueError):  # gone, or a line without an end
+        except (ConnectionError, ValueError):  # disconnected, or a line without an end
             pass
         finally:
             writer.close()

@@ -1,4 +1,4 @@
-"""Between Khepera lines and fleet messages, and one Khepera as a robot. Sans-IO."""
+"""Translates Khepera lines to fleet messages and commands to lines; one Khepera as a robot. Sans-IO."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ AGAIN_S, STOP_AGAIN_S = 0.5, 0.1
 BEARINGS_DEG = dict(zip(Proximity.__struct_fields__, (-150, -85, -45, -15, 15, 45, 85, 150), strict=True))
 RANGE_M = (0.005, 0.06)
 LIGHT, DISTANCE_M = [20, 60, 150, 350, 700, 1023], [0.06, 0.05, 0.035, 0.02, 0.01, 0.005]
-"""How far an obstacle is at each value of a sensor."""
+"""Values of a sensor, and the distance of an obstacle at each."""
 
 
 class Options(protocol.Differential, frozen=True, kw_only=True):
@@ -66,7 +66,7 @@ class KheperaRobot(protocol.Robot):
             scan = self._scan.take(name, float(np.interp(light, LIGHT, DISTANCE_M, left=np.nan)), stamp_ns)
         return ((topics.SCAN, scan),) if scan is not None else ()
 
-    # What the robot is told
+    # What the robot is sent
 
     def command(self, topic: Topic, command: FleetMessage, now: float) -> protocol.Outcome:
         if isinstance(command, Drive):
@@ -84,7 +84,7 @@ class KheperaRobot(protocol.Robot):
         self._drive(SetSpeeds(0, 0), now, period_s=STOP_AGAIN_S, until=until, urgent=True)
 
     def ask(self, topic: Topic) -> None:
-        raise protocol.Unsupported(f"a Khepera cannot be asked for its {topic.path}")
+        raise protocol.Unsupported(f"a Khepera cannot be queried for its {topic.path}")
 
     def _drive(self, speeds: SetSpeeds, now: float, **how: Any) -> None:
         session = self._connected()
@@ -97,5 +97,5 @@ class KheperaRobot(protocol.Robot):
 
 
 def _speeds(left_m_s: float, right_m_s: float) -> SetSpeeds:
-    unit_m_s = max(UNIT_M_S, abs(left_m_s) / MOST_UNITS, abs(right_m_s) / MOST_UNITS)  # both slower: the curve stays
+    unit_m_s = max(UNIT_M_S, abs(left_m_s) / MOST_UNITS, abs(right_m_s) / MOST_UNITS)  # scale both: keeps the curve
     return SetSpeeds(round(left_m_s / unit_m_s), round(right_m_s / unit_m_s))

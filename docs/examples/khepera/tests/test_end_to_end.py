@@ -42,7 +42,7 @@ def running(*arguments: str) -> Iterator[None]:
 
 
 class SerialKhepera:
-    """A simulated robot at the far end of a serial line; ``address``: the near end. A mute one obeys, but is silent."""
+    """A simulated robot on a serial line; ``address``: the near end. A mute one never answers."""
 
     def __init__(self) -> None:
         self.robot, self.mute = Khepera(), False
@@ -90,7 +90,7 @@ async def connected(endpoint: str, stack: contextlib.AsyncExitStack) -> zbridge.
 
 @contextlib.asynccontextmanager
 async def gateway(address: str, folder: Path) -> AsyncIterator[zbridge.Robot]:
-    """Run a gateway for the robot at an address; give the robot as it is on the bus, once it is established."""
+    """Run a gateway for the robot at an address; yield the robot on the bus, once it is established."""
     endpoint, file = f"tcp/127.0.0.1:{free_port()}", folder / "k1.toml"
     file.write_text(
         f'[robot]\nname = "k1"\n[device]\nprotocol = "khepera"\nconnect = ["{address}"]\n'
@@ -107,7 +107,7 @@ async def gateway(address: str, folder: Path) -> AsyncIterator[zbridge.Robot]:
 
 
 async def drive(address: str, folder: Path) -> None:
-    """Drive the robot at an address through the bus, and see it stand."""
+    """Drive the robot at an address through the bus, and check that it stops."""
     async with gateway(address, folder) as robot:
         async with robot.control() as control:
             await control.during(1.5, forward=0.4)

@@ -1,4 +1,4 @@
-"""The Khepera protocol: golden lines, a conversation with the simulated robot without any link, units and axes."""
+"""The Khepera protocol: golden lines, a conversation with the simulated robot without a link, units and axes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from zbridge.protocol.session import State
 
 
 class Scene:
-    """A gateway's robot and the simulated one, joined without a link; ``run`` lets time pass."""
+    """A gateway's robot and the simulated one, connected without a link; ``run`` advances time."""
 
     def __init__(self) -> None:
         self.robot = KheperaRobot(Options())
@@ -62,12 +62,12 @@ def test_golden_lines() -> None:
 
 
 @pytest.mark.parametrize("line", [b"\n", b"z\n", b"e,1\n", b"e,1,128\n", b"n,0,1,2,3,4,5,6,1024\n", b"e,1,x\n"])
-def test_what_is_no_line_of_the_protocol(line: bytes) -> None:
+def test_an_invalid_line_raises_protocol_error(line: bytes) -> None:
     with pytest.raises(ProtocolError):
         LINES.read(line)
 
 
-def test_a_speed_out_of_range_is_not_written() -> None:
+def test_a_speed_out_of_range_is_not_encoded() -> None:
     with pytest.raises(EncodeError):
         LINES.write(SetSpeeds(128, 0))
 
@@ -100,7 +100,7 @@ def test_forward_is_along_x_and_a_left_turn_counter_clockwise(scene: Scene) -> N
     assert scene.simulated.body.heading == pytest.approx(scene.shown["pose"].heading, abs=0.1)
 
 
-def test_a_stop_goes_before_what_waits_and_the_robot_stands(scene: Scene) -> None:
+def test_a_stop_precedes_queued_requests_and_the_robot_stops(scene: Scene) -> None:
     scene.drive(1.0)
     scene.run(0.5)
     scene.robot.command(topics.CMD_LIGHT, Switch(on=True), scene.now)
@@ -114,7 +114,7 @@ def test_a_stop_goes_before_what_waits_and_the_robot_stands(scene: Scene) -> Non
     assert scene.simulated.leds == {0: True}
 
 
-def test_a_robot_that_falls_silent_takes_no_commands_and_is_lost_in_the_end(scene: Scene) -> None:
+def test_a_robot_that_falls_silent_gets_no_commands_and_is_finally_lost(scene: Scene) -> None:
     scene.drive(1.0)
     scene.answers = False
     scene.run(0.6)
@@ -123,7 +123,7 @@ def test_a_robot_that_falls_silent_takes_no_commands_and_is_lost_in_the_end(scen
     assert scene.session.reason == "no answer to 10 requests in a row"
 
 
-def test_the_simulated_robot_stands_when_nobody_asks() -> None:
+def test_the_simulated_robot_stops_during_a_silence() -> None:
     robot = Khepera()
     assert robot.answer(b"D,100,100\n") == b"d\n"
     assert robot.answer(b"nonsense\n") == b""
@@ -140,7 +140,7 @@ def test_a_near_obstacle_is_a_short_range_at_its_bearing() -> None:
     assert scan.ranges[place] == pytest.approx(0.01)
 
 
-def test_what_it_cannot_do_is_refused_with_a_reason(scene: Scene) -> None:
+def test_an_unsupported_command_is_refused_with_a_reason(scene: Scene) -> None:
     for topic, command in ((topics.CMD_DRIVE, Drive(left=1.0)), (topics.CMD_MODE, Mode(mode="manual"))):
         with pytest.raises(Refused):
             scene.robot.command(topic, command, scene.now)
@@ -167,7 +167,7 @@ def test_a_new_connection_does_not_move_the_pose() -> None:
     assert pose.x == again.x == pytest.approx(0.1)
 
 
-def test_speeds_over_full_scale_are_shown_as_full_scale() -> None:
+def test_speeds_over_full_scale_are_published_as_full_scale() -> None:
     ((_, motion),) = KheperaRobot(Options()).telemetry(Speeds(127, 127), 1)
     assert motion.speed == 1.0
 

@@ -24,8 +24,12 @@ class Command:
         fields = read(payload)
         self.kind = key.partition("@cmd/")[2].partition("/")[0]
         self.who = who
-        self.put_at = now
+        self.put_at = self.given_at = now
+        """When it was put on the bus, and when its program gave it."""
         self.lease = shown.get("lease")
+        self.number = shown.get("seq", 0)
+        self.called_off: float | None = None
+        """When its sender said neutral, or chose another mode; of a mode."""
         self.dated = "t" in shown
         self.received: dict[str, float] = {}
         """By gateway."""
@@ -65,6 +69,7 @@ class Grant:
         """Whether ``control`` showed it."""
         self.autonomous = False
         self.last_motion: Command | None = None
+        self.last_mode: Command | None = None
         self.held_back = False
         self.used = False
         """Whether anything was sent with it."""
@@ -92,13 +97,16 @@ class Grant:
     def received(self, command: Command, now: float) -> None:
         """Follow a command that reached the gateway: when motion must wait for neutral."""
         self.used = True
-        late_s = now - command.put_at
+        late_s = now - command.given_at
         self.base_s = min(self.base_s, late_s)
         late_s -= self.base_s
         if not command.dated or late_s < MAX_AGE_S + 0.1:
             self.renewed_at = now
+        mode = self.last_mode
+        if mode is not None and mode.called_off is None and not command.value and command.number > mode.number:
+            mode.called_off = now
         if command.kind == "mode":
-            self.autonomous = command.value > 0
+            self.autonomous, self.last_mode = command.value > 0, command
             return
         if not command.value:
             if late_s < 0.3:
@@ -109,7 +117,7 @@ class Grant:
             return  # refused as stale, or nearly: it begins nothing
         last = self.last_motion
         if last is not None:
-            since_s = now - (last.put_at if last.dated else last.received[self.gateway])
+            since_s = now - (last.given_at if last.dated else last.received[self.gateway])
             if since_s > self.deadman_s + self.base_s + 0.1:
                 self.held_back = True
         if self.held_back:

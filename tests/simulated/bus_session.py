@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 
 from tests.simulated.bus import NEWS_S, Fabric, SimSession
+from tests.simulated.engine import THREAD_S
 from zbridge.bus.fake import matches, meet
 from zbridge.bus.inbox import Inbox
 from zbridge.bus.interface import Answer, Lane, Sample
@@ -207,7 +208,9 @@ class SimBus:
     # The rest
 
     async def flush(self) -> None:
-        await asyncio.sleep(max(1e-4, self._written_at - self.fabric.world.now))
+        process = self.session.process
+        late_s = process.rng.random() * process.host.thread_s if process.host.thread_s > THREAD_S else 0.0
+        await asyncio.sleep(max(1e-4, self._written_at - self.fabric.world.now) + late_s)
 
     async def drain(self, key_expr: str) -> None:
         await asyncio.sleep(1e-3)

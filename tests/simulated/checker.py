@@ -61,6 +61,8 @@ class Checker:
         self._gives: dict[str, deque[tuple[float, float]]] = {
             each.name: deque(maxlen=200) for each in simulation.programs
         }
+        self._given_at: dict[tuple[str, float], float] = {}
+        """By driver and value, when it was given last."""
         self._taken_at: dict[str, float] = {}
         """By the name of a holder, when a stop or a takeover ended its lease."""
         self._wrote_motion: dict[str, float] = {}
@@ -254,9 +256,14 @@ class Checker:
         kind = key.partition("@cmd/")[2].partition("/")[0]
         if kind in ("drive", "motor", "mode") and attachment:
             command = Command(key, payload, read(attachment), who, self.world.now)
+            if command.value and command.dated:
+                command.given_at = self._given_at.get((who, command.value), command.given_at)
             self._commands.setdefault((key, payload, attachment), command)
-            if who in self.gateways and kind != "mode" and command.value:
-                self._of_program(who, command)
+            if who in self.gateways and kind != "mode":
+                if command.value:
+                    self._of_program(who, command)
+                else:
+                    self.released.rested[who] = self.world.now
         elif kind == "stop":
             self.counts["stops"] += 1
 
@@ -273,12 +280,21 @@ class Checker:
                 later = value
                 if min(value, other) - 0.0052 < command.value < max(value, other) + 0.0052:
                     self.released.put(program.name, list(self._gives[program.name]))
+                    if program.protocol == "tcpudp":  # one value a command
+                        self.released.put_late(listener, program.name, at, list(self._gives[program.name]))
                     return
         self.violate("hq-motion", f"{listener} put {command}, which no HQ program said lately")
+
+    def said_last(self, program: str) -> float:
+        """Return what a program said last, 0 for neutral."""
+        said = self._gives.get(program)
+        return said[-1][1] if said else 0.0
 
     def _on_gives(self, who: str, value: float) -> None:
         if who in self._gives:
             self._gives[who].append((self.world.now, value))
+        else:
+            self._given_at[who, value] = self.world.now
 
     def _on_receives(self, gateway: str, key: str, payload: bytes, attachment: bytes | None) -> None:
         now = self.world.now
@@ -363,12 +379,14 @@ class Checker:
             return "no-lease", "received before its lease"
         if command.forbidden:
             return "neutral-first", "after the deadman, without a neutral"
-        late_s = received - command.put_at - grant.base_s
+        late_s = received - command.given_at - grant.base_s
         if command.dated and late_s > min(MAX_AGE_S, grant.deadman_s) + 0.05:
             return "stale", f"it came {late_s:.2f} s late"
+        if command.called_off is not None and now > command.called_off + SLACK_S:
+            return "called-off", f"it was called off {now - command.called_off:.2f} s ago"
         if command.kind == "mode":
             return ("stale", "long ago") if now - received > 2.5 else None
-        given_at = command.put_at + grant.base_s if command.dated else received
+        given_at = command.given_at + grant.base_s if command.dated else received
         if now - given_at > grant.deadman_s + 0.1:
             return "deadman", f"given {now - given_at:.2f} s ago, deadman {grant.deadman_s:g} s"
         return None

@@ -90,6 +90,8 @@ class Host:
         self.name = name
         self.wall_offset_s = 1.7e9
         self.suspended_s = 0.0
+        self.thread_s = THREAD_S
+        """Longest time of what a thread does, such as writing to a disk; seconds."""
         self._rate = 1.0 + drift
         self._raw_rate = 1.0 + drift * 1.5
         self._offset_s = offset_s
@@ -333,7 +335,7 @@ class SimLoop(asyncio.AbstractEventLoop):
             if not future.done():
                 self.call_soon(_settle, future, outcome, error)
 
-        self.process.after(self.process.rng.random() * THREAD_S, work)
+        self.process.after(self.process.rng.random() * self.process.host.thread_s, work)
         return future
 
     def call_exception_handler(self, context: dict[str, Any]) -> None:

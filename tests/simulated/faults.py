@@ -207,6 +207,16 @@ class Faults:
 
         self._later(step, undo)
 
+    def _threads(self, step: dict[str, Any]) -> None:
+        """Slow the threads of a machine down: a busy disk, a bus that is written to late."""
+        host = self._simulation.members[step["target"]].host
+        host.thread_s, usual_s = step["by"], host.thread_s
+
+        def undo() -> None:
+            host.thread_s = usual_s
+
+        self._later(step, undo)
+
     def _lose(self, step: dict[str, Any]) -> None:
         """Lose a part of all datagrams."""
         paths = self._simulation.paths

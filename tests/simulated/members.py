@@ -225,6 +225,21 @@ class DriverMember(Member):
         if step.get("mode"):
             self.note("gives mode", step["mode"])
             await drive.mode(step["mode"])
+        modes = loop.create_task(self._contained(self._repeat_mode(drive))) if step.get("modes") else None
+        try:
+            await self._give(drive, step, ends_at, hz)
+        finally:
+            if modes is not None:
+                modes.cancel()
+
+    async def _repeat_mode(self, drive: Any) -> None:
+        """Choose the mode again and again, beside what else is given: another task of the same program."""
+        while True:
+            await drive.mode("manual")
+            await asyncio.sleep(0.3)
+
+    async def _give(self, drive: Any, step: dict[str, Any], ends_at: float, hz: float) -> None:
+        loop = asyncio.get_running_loop()
         while loop.time() < ends_at and not drive.lost.is_set():
             try:
                 if not step.get("silent"):

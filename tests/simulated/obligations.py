@@ -91,6 +91,9 @@ class Obligations:
     def _on_robot(self, what: str, fields: tuple[Any, ...]) -> None:
         if what == "connected":
             self._connected_at = self.world.now
+            grant = self.checker.current.get(self.checker.by_host.get(fields[0][0], ""))
+            if grant is not None:  # docs/control.md, "hold back": a robot that was lost is stopped when it comes back
+                grant.autonomous = False
         elif what in ("drops", "ignores"):
             self._dropped_at = self.world.now
             self.checker.counts[f"robot {what}"] += 1
@@ -286,7 +289,7 @@ class Obligations:
     def probed(self) -> None:
         """The robot was driven, and rests."""
         robot = self.simulation.robot
-        if robot.crashed or getattr(robot, "single", False):
+        if robot.crashed or robot.single or robot.used_up:
             return
         if "read" not in self._probe:
             self.checker.violate("drivable", "nobody can drive the robot long after all faults are over")

@@ -18,6 +18,10 @@ GONE_S = 0.8
 """Longest time until the lease of an HQ program that disconnected is given back."""
 FROZEN_S = 0.9
 """A listener that did not run for so long asks its programs for a neutral: it looks every 0.1 s, for 0.6 s."""
+ORDER_S = 0.1
+"""What a program says so long after something else arrives after it, by stream and by datagram."""
+AWAY_S = 0.8
+"""A robot whose gateways were all killed so long ago is away for listeners that the bus reaches."""
 ALONE_S = 9.0
 """Longest time until the only gateway that runs serves the robot."""
 
@@ -36,6 +40,14 @@ class Released:
         """By program, when it last gave motion or a mode."""
         self._mode: dict[str, int] = {}
         self._paused: dict[str, float] = {}
+        self.rested: dict[str, float] = {}
+        """By listener, when it put neutral last."""
+        self._noisy_at = -1.0
+        """When a path was last cut, slow or lossy."""
+        self._refused: set[str] = set()
+        """Programs that pushed while no gateway served the robot, and have not said neutral since."""
+        self._served_at = 0.0
+        """When a gateway that serves the robot was last there."""
         self._frozen: dict[str, float] = {}
         """By program, when its listener ran again after a freeze in which the program pushed."""
 
@@ -44,6 +56,9 @@ class Released:
         if what == "gives" and who == self._only:
             if fields[0]:
                 self._spoke_at[who] = self._world.now
+                self._on_pushed(who)
+            else:
+                self._refused.discard(who)
         elif what == "gives mode":
             self._mode[who], self._spoke_at[who] = fields[0], self._world.now
         elif what == "lost listener" and who == self._only:
@@ -51,6 +66,7 @@ class Released:
         elif what == "connected to listener":
             self._mode.pop(who, None)
             self._frozen.pop(who, None)
+            self._refused.discard(who)
         elif what == "paused" and who in self._checker.gateways:
             self._paused[who] = self._world.now
         elif what == "resumed" and who in self._paused and self._world.now - self._paused.pop(who) > FROZEN_S:
@@ -61,6 +77,9 @@ class Released:
 
     def put(self, program: str, gives: list[tuple[float, float]]) -> None:
         """Judge motion that a listener put for a program. gives: what that said, and when."""
+        if program in self._refused:
+            self._refused.discard(program)
+            self._checker.violate("hq-neutral", f"{program} pushed while the robot was away, and moves it by that")
         since = self._frozen.get(program)
         if since is None:
             return
@@ -69,8 +88,45 @@ class Released:
         else:
             self._checker.violate("hq-neutral", f"a listener that was frozen put motion of {program}, without neutral")
 
+    def put_late(self, listener: str, program: str, given_at: float, gives: list[tuple[float, float]]) -> None:
+        """Judge motion that a listener put though its program said neutral since: that neutral comes at once."""
+        put_at, grant = self._world.now, self._of_program()
+        said_at = max((at for at, value in gives if not value), default=0.0)
+        late = said_at > given_at + ORDER_S and put_at > said_at + ORDER_S
+        if self._only != program or not late or grant is None or self._noisy_at > given_at - 1.0:
+            return
+
+        def look() -> None:
+            holds = grant.ended_at is None and self._simulation.members[listener].running
+            if holds and self.rested.get(listener, 0.0) < put_at and self._noisy_at < given_at:
+                self._checker.violate("hq-order", f"{listener} put motion of {program} after its newer neutral")
+
+        self._world.after(ORDER_S, look)
+
+    def _on_pushed(self, program: str) -> None:
+        """Motion that an HQ program says while no gateway is there is refused: it must say neutral then."""
+        begun, calm = self._world.now, self._checker.obligations.calm_since
+        if begun - self._served_at < AWAY_S or not calm(begun - AWAY_S / 2):
+            return
+
+        def look() -> None:
+            away = self._served_at < begun and self._simulation.members[self._listener(program)].running
+            if away and calm(begun - AWAY_S / 2) and self._checker.said_last(program):
+                self._refused.add(program)
+
+        self._world.after(AWAY_S / 2, look)
+
+    def _listener(self, program: str) -> str:
+        host = next(each.address[0] for each in self._simulation.programs if each.name == program)
+        return next(each.name for each in self._checker.gateways.values() if each.host.name == host)
+
     def tick(self) -> None:
         """Look for leases that nobody uses, and for a robot that nobody serves."""
+        paths = self._simulation.paths
+        if paths.cuts or paths.slow or paths.loss or paths.duplicates:
+            self._noisy_at = self._world.now
+        if any(each.alive for each in self._checker.gateways.values() if each.serves):
+            self._served_at = self._world.now
         self._look_for_unused()
         self._look_for_served()
 

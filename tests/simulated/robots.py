@@ -32,6 +32,8 @@ class SimRobot(Process):
         self.options = options
         self.self_stop_s: float | None = options.get("self_stop_s")
         self.single = bool(options.get("single"))
+        self.used_up = False
+        """Whether the connection is not the one usable one of this start."""
         self.moving = False
         self.by_itself = False
         self.crashed: str | None = None
@@ -180,6 +182,7 @@ class TcpUdpRobot(SimRobot):
         return super().may_accept() and not (self.single and self._used)
 
     def greet(self, end: End) -> None:
+        self.used_up = self._used and bool(self.options.get("poor_again"))
         self._used = True
         self._clients += 1
         versions = {"1.3": "1.1,1.2,1.3", "1.4": "1.1,1.2,1.3,1.4"}.get(self.version, self.version).encode()
@@ -197,7 +200,7 @@ class TcpUdpRobot(SimRobot):
             self.write(end, _PACKET.pack(2 + len(body), 1, kind) + body)
 
     def tell(self, end: End) -> None:
-        if self.world.now >= self._asleep_until:
+        if self.world.now >= self._asleep_until and not self.used_up:
             self.put(end, _PACKET.pack(14, 1, 55) + struct.pack("<fff", self.told + 1, 2.0, 3.0))
 
     def read_delay(self, end: End) -> float:
@@ -218,6 +221,8 @@ class TcpUdpRobot(SimRobot):
             return
         length = int.from_bytes(data[:4], "little", signed=True)
         stalled = self.resumed_at > self._stalled_at
+        if self.used_up and self.rng.random() < 0.5:
+            return
         if length + 4 != len(data):
             self.world.note(self.name, "drops", len(data))
             if stalled and self.version in ("1.1", "1.2"):

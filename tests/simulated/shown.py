@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 NEWS_S = 0.2
 SETTLED_S = 1.5
 """Longest time that a handshake takes once the connection is there and the robot takes commands."""
+UDP_S = 2.5
+"""How much longer a handshake with datagrams takes."""
 
 
 class Shown:
@@ -50,7 +52,9 @@ class Shown:
             elif now - self._apart_since.setdefault(gateway, now) > NEWS_S + 0.1 and self._judges(gateway, NEWS_S):
                 checker.violate("status", f"{gateway} shows established, and has no connection")
                 self._apart_since.pop(gateway)
-        settled = works is not None and now - self._works_since[1] > SETTLED_S
+        robot = checker.simulation.robot  # a handshake may have waited while the robot was paused
+        begun = max(self._works_since[1], robot.resumed_at + (UDP_S if getattr(robot, "udp", False) else 0.0))
+        settled = works is not None and now - begun > SETTLED_S
         if works is not None and settled and self._state.get(works) != "established" and self._judges(works, SETTLED_S):
             checker.violate("status", f"{works} shows {self._state.get(works)}, and its robot is established")
             self._works_since = (works, now)

@@ -88,6 +88,16 @@ def _reconnected(rng: random.Random, made: Made) -> None:
     made["steps"].append(_drive(t + rng.uniform(0.6, 1.5), "op2", takeover=True))
 
 
+def _reconnected_in_mode_3(rng: random.Random, made: Made) -> None:
+    """The connection to a robot that drives itself is reset; its driver still holds the lease, and says nothing."""
+    options = {"version": rng.choice(("1.1", "1.3", "1.4")), "lossless": bool(made["control"])}
+    made["robot"] = {"protocol": "tcpudp", "options": options, "device": {}}
+    made["drivers"][0]["options"] = {}  # the client that chooses modes
+    made["steps"] = [_drive(3.0, "op1", mode="autonomous", silent=True) | {"for": 9.0}]
+    after = rng.uniform(0.0, 3.0)
+    made["steps"].append(_fault(2.9, "reset", between=["robot", "gw1"], when="mode read", after=round(after, 3)))
+
+
 def _wiggled_over_a_cut(rng: random.Random, made: Made) -> None:
     """An HQ program pushes and releases its stick while its network is cut, and all of it arrives at once."""
     gateway, t = _stick(rng, made, alone=rng.random() < 0.5), 5.0
@@ -106,6 +116,19 @@ def _frozen_listener(rng: random.Random, made: Made) -> None:
     gateway = _stick(rng, made, alone=True)
     freeze = _fault(rng.uniform(5.0, 6.0), "pause", target=gateway["name"], **{"for": rng.uniform(0.95, 1.25)})
     made["steps"] = [_drive(3.5, "stick1") | {"for": 6.0}, freeze]
+
+
+def _frozen_shortly(rng: random.Random, made: Made) -> None:
+    """A listener is frozen, too shortly to notice it, while its program pushes by datagrams and says neutral by TCP."""
+    gateway, t = _stick(rng, made, alone=True), rng.uniform(5.0, 7.0)
+    gateway["hq"] = ["tcpudp"]
+    made["programs"][0] |= {"protocol": "tcpudp", "options": {"udp": True}}
+    steps = [_drive(3.0, "stick1") | {"for": rng.uniform(0.5, 1.5)}]
+    for _ in range(4):
+        steps.append(_fault(t - 0.05, "pause", target=gateway["name"], **{"for": 0.45}))
+        steps.append(_drive(t, "stick1") | {"for": rng.uniform(0.2, 0.35)})
+        t += rng.uniform(2.0, 5.0)
+    made["steps"] = steps
 
 
 def _idle_or_gone(rng: random.Random, made: Made) -> None:
@@ -145,6 +168,56 @@ def _killed_in_mode_3(rng: random.Random, made: Made) -> None:
         made["steps"] += [_fault(2.5, "cut", between=["router1", "router2"], both=True, **{"for": 8.0})]
 
 
+def _called_off(rng: random.Random, made: Made) -> None:
+    """Somebody chooses mode 3 and calls it off at once, by neutral or another mode; the gateway's disk is slow."""
+    if made["robot"]["protocol"] != "tcpudp":
+        made["robot"] = {"protocol": "tcpudp", "options": {"version": rng.choice(("1.1", "1.3", "1.4"))}, "device": {}}
+    made["drivers"][0]["options"] = {}  # the client that chooses modes
+    then = rng.choice((None, None, "manual"))
+    drive = _drive(5.0, "op1", mode="autonomous", silent=True, then=then, hz=rng.choice((20.0, 50.0)), holds=1.0)
+    made["steps"] = [_fault(4.0, "threads", target="gw1", by=0.8, **{"for": 6.0}), drive | {"for": 0.01}]
+
+
+def _busy_program(rng: random.Random, made: Made) -> None:
+    """A program drives, and chooses modes in another task, while its threads are slow: drives wait for their turn."""
+    if made["robot"]["protocol"] != "tcpudp":
+        made["robot"] = {"protocol": "tcpudp", "options": {"version": rng.choice(("1.1", "1.3", "1.4"))}, "device": {}}
+    made["drivers"][0]["options"] = {}  # the client, which dates
+    drive = _drive(3.0, "op1", modes=True, deadman_s=rng.choice((1.0, 1.5)), hz=10.0) | {"for": 6.0}
+    made["steps"] = [drive, _fault(3.8, "threads", target="op1", by=1.2, **{"for": 4.0})]
+
+
+def _pushed_while_away(rng: random.Random, made: Made) -> None:
+    """An HQ program begins to push while no gateway serves the robot, and goes on when one does."""
+    _stick(rng, made, alone=True)
+    t = rng.uniform(5.0, 7.0)
+    kill = _fault(t, "kill", target="gw1", **{"for": rng.uniform(2.5, 4.0)})
+    made["steps"] = [
+        _drive(3.0, "stick1") | {"for": 1.0},
+        kill,
+        _drive(t + rng.uniform(1.0, 2.0), "stick1") | {"for": 9.0},
+    ]
+
+
+def _used_up(rng: random.Random, made: Made) -> None:
+    """The robot's one usable connection ends: on the next one it says nothing, and loses half of what it is sent."""
+    options = {"version": rng.choice(("1.1", "1.3", "1.4")), "udp": rng.random() < 0.5, "poor_again": True}
+    made["robot"] = {"protocol": "tcpudp", "options": options, "device": {}}
+    made["steps"] = [_fault(rng.uniform(9.0, 11.0), "reset", between=["robot", "gw1"])]
+    made["steps"] += [_drive(t, rng.choice(("op1", "op2")), takeover=True) for t in (9.0, 14.0, 19.0, 24.0)]
+
+
+def _failed_restarts(rng: random.Random, made: Made) -> None:
+    """The restarts of both gateways fail; later both serve the robot, each drives it, and they meet."""
+    made["steps"] = _split(rng, made, t=9.0, s=rng.uniform(9.0, 11.0))
+    for number, gateway in enumerate(("gw1", "gw2")):
+        t = 3.0 + 3 * number
+        kill = _fault(t, "kill", target=f"{gateway}+", when=rng.choice(("Given sent", "Given got", "Up unsent")))
+        made["steps"] += [_fault(t, "restart", target=gateway), kill]
+    healed_at = 9.0 + made["steps"][0]["for"]
+    made["steps"] += [_drive(healed_at - 1.5, driver) | {"for": 8.0} for driver in ("op1", "op2")]
+
+
 def _killed_driver(rng: random.Random, made: Made) -> None:
     """The driver's process is killed while it drives, or its bus is lost, or it is frozen."""
     kind = rng.choice(("kill", "pause", "unlink"))
@@ -164,13 +237,20 @@ SITUATIONS: tuple[Callable[[random.Random, Made], None], ...] = (
     _silent_holder,
     _stalled_link,
     _reconnected,
+    _reconnected_in_mode_3,
     _wiggled_over_a_cut,
     _frozen_listener,
+    _frozen_shortly,
     _idle_or_gone,
     _two_owners,
     _two_owners,
     _killed_in_mode_3,
     _killed_in_mode_3,
+    _called_off,
+    _busy_program,
+    _pushed_while_away,
+    _used_up,
+    _failed_restarts,
     _killed_driver,
     _forged_and_flooded,
 )

@@ -7,6 +7,7 @@ import struct
 import time
 from pathlib import Path
 
+import msgpack
 import pytest
 
 from tests.simulated.accounts import Command, Grant, motions
@@ -101,6 +102,20 @@ def test_the_checker_reads_the_frames_of_the_protocol_pages(
     protocol: str, data: str, expected: list[tuple[str, float]]
 ) -> None:
     assert motions(protocol, bytes.fromhex(data)) == expected
+
+
+def test_the_checker_knows_that_neutral_calls_a_mode_off() -> None:
+    grant = Grant("gw", "op", {"lease": b"12345678", "expires_in_s": 3.0}, {}, 0.0)
+    modes = [_said("mode", {"mode": "autonomous"}, 1), _said("mode", {"mode": "autonomous"}, 4)]
+    commands = [modes[0], _said("drive", {"forward": 0.0}, 0), _said("drive", {"forward": 0.0}, 3), modes[1]]
+    for now, command in enumerate(commands):
+        grant.received(command, float(now))
+    assert [mode.called_off for mode in modes] == [2.0, None]
+
+
+def _said(kind: str, fields: dict[str, object], number: int) -> Command:
+    shown = {"lease": b"12345678", "seq": number}
+    return Command(f"fleet/r1/@cmd/{kind}", msgpack.packb(fields), shown, "op", 0.0)
 
 
 def test_the_checker_knows_that_motion_after_the_deadman_needs_a_neutral() -> None:

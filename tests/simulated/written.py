@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 STALLED_S = 0.45
 """A link that acknowledges nothing for so long is stalled for the gateway too, which looks after 0.3 s."""
+DOUBTED_S = 11.0
+"""Longest time until a gateway doubts a connection: a handshake with UDP, and 5 s."""
 ASIDE_S = 1.3
 """Longest time until a gateway that leaves its robot to another one has stopped it."""
 
@@ -42,10 +44,12 @@ class Written:
         self._moves: set[str] = set()
         """Gateways whose last frame of the kind was motion."""
         self._aside: set[str] = set()
+        self._connected_at = 0.0
 
     def watch(self, who: str, what: str, fields: tuple[Any, ...]) -> None:
         """Follow the trace."""
         if who == "robot" and what == "connected":
+            self._connected_at = self._world.now
             gateway = self._checker.by_host.get(fields[0][0])
             if gateway is not None:
                 self._owes[gateway] = "since the robot was connected"
@@ -64,6 +68,8 @@ class Written:
             self._moves.discard(gateway)
         elif any(kind != "mode" or value == 3.0 for kind, value in motions(protocol, data)):
             self._moves.add(gateway)
+            if self._checker.simulation.robot.used_up and self._world.now - self._connected_at > DOUBTED_S:
+                self._checker.violate("in-doubt", f"{gateway} wrote motion on a connection that is not the usable one")
             why = self._owes.pop(gateway, None)
             if why is not None:
                 self._checker.violate("stop-first", f"{gateway} wrote motion, and no stop {why}")

@@ -337,7 +337,7 @@ PAIRS: list[tuple[type, type]] = [
     (Driver, blocking.Driver),
     (zbridge.client.StateFeed, blocking.StateFeed),
 ]
-INSIDE = {"now", "acquire", "look", "release", "statuses"}
+INSIDE = {"now", "acquire", "read_control", "release", "statuses"}
 """What the driver's own context and callbacks use, and the look at how robots are."""
 
 

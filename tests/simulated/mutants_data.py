@@ -410,7 +410,7 @@ MUTANTS = (
         "control is not published",
         None,
         ENFORCER,
-        "            if self._control_due is None:\n"
+        "            if self._control_due is None and not self._closed:\n"
         "                self._control_due = self._loop.call_later(_CONTROL_S, self.report)\n"
         "        if changed:\n            self.report()",
         "            pass",

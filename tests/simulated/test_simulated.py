@@ -13,8 +13,9 @@ import pytest
 from tests.simulated.accounts import Command, Grant, motions
 from tests.simulated.engine import Host, Process, SimLoop, World
 from tests.simulated.generate import PROFILES, scenario
-from tests.simulated.mutants import caught_by
+from tests.simulated.mutants import ROOT, caught_by
 from tests.simulated.mutants_data import MUTANTS
+from tests.simulated.mutants_handover import HANDOVER
 from tests.simulated.scenario import run
 from tests.simulated.shrink import shrink
 
@@ -45,6 +46,11 @@ def test_the_same_scenario_gives_the_same_trace(profile: str) -> None:
 def test_the_findings_that_began_it_are_found_again(name: str, tmp_path: Path) -> None:
     mutant = next(each for each in MUTANTS if each.name == name)
     assert caught_by(mutant, tmp_path, seconds=60.0, seed=20_000) is not None
+
+
+def test_every_broken_variant_still_finds_what_it_breaks() -> None:
+    found = {each.name: (ROOT / each.file).read_text().count(each.old) for each in (*MUTANTS, *HANDOVER)}
+    assert {name: times for name, times in found.items() if times != 1} == {}
 
 
 def test_a_failing_scenario_is_made_smaller(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -207,7 +207,7 @@ async def test_with_a_folder_alone_a_member_is_connected_and_one_without_the_rob
     async with zbridge.connect(tls=lab.folder.of("ann").folder) as fleet:
         assert await fleet.robots() == {}
     file = lab.path / "r2.toml"
-    file.write_text(f'[robot]\nname = "r2"\n{device(1)}')
+    file.write_text(f'[robot]\nname = "r2"\n{device(free_port())}')
     checked = start("check", str(file), "--tls", str(lab.folder.of("ann").folder))
     assert (
         "not checked: whether the router knows gateway.ann and lets it serve r2" in checked.communicate(timeout=30)[0]

@@ -212,7 +212,9 @@ def _failed_restarts(rng: random.Random, made: Made) -> None:
     made["steps"] = _split(rng, made, t=9.0, s=rng.uniform(9.0, 11.0))
     for number, gateway in enumerate(("gw1", "gw2")):
         t = 3.0 + 3 * number
-        kill = _fault(t, "kill", target=f"{gateway}+", when=rng.choice(("Given sent", "Given got", "Up unsent")))
+        kill = _fault(
+            t, "kill", target=f"{gateway}+", when=rng.choice(("HandoverState sent", "HandoverState got", "Up unsent"))
+        )
         made["steps"] += [_fault(t, "restart", target=gateway), kill]
     healed_at = 9.0 + made["steps"][0]["for"]
     made["steps"] += [_drive(healed_at - 1.5, driver) | {"for": 8.0} for driver in ("op1", "op2")]

@@ -168,6 +168,10 @@ class Fabric:
         same = one.router == other.router
         return self.reaches(one, other) and one.link.whole and other.link.whole and (same or self.between.whole)
 
+    def accepts(self, host: str, router: str) -> bool:
+        """Whether a new session connects."""
+        return self.routers[router].up and self.paths.up(host, router) and self.paths.up(router, host)
+
     def carry(
         self, one: SimSession, other: SimSession, order: str, size: int, deliver: Callable[[], None], *, droppable: bool
     ) -> None:

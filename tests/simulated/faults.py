@@ -177,6 +177,12 @@ class Faults:
         link.drop(stays=True)
         self._later(step, link.restore)
 
+    def _lock(self, step: dict[str, Any]) -> None:
+        """Let a member's session lose its connection, and never make one again."""
+        member = self._simulation.members[step["target"]]
+        if member.alive:
+            member.session.link.lock()
+
     def _router(self, step: dict[str, Any]) -> None:
         """Restart a router: all of its links end."""
         fabric = self._simulation.fabric

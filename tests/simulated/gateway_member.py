@@ -29,6 +29,8 @@ from zbridge.metrics import Metrics
 NEW, OLD = "+", "-"
 BOOT_S = (0.15, 0.6)
 """Seconds until a process that was started runs the gateway."""
+OPEN_S = 0.05
+"""Seconds that a session takes to connect."""
 AGAIN_S = 1.0
 """Seconds until a process that ended with an error is started again."""
 
@@ -173,7 +175,15 @@ class GatewayMember(Member):
         process, rng = life.process, life.process.rng
 
         async def join(plan: GatewayPlan, metrics: Metrics) -> Any:
+            if not life.session.open:  # it has left the bus
+                life.session = SimSession(self.fabric, process, self.router)
+                if life is self.life:
+                    self.session = life.session
             return SimBus(life.session, metrics)
+
+        async def can_connect(plan: GatewayPlan) -> bool:
+            await asyncio.sleep(OPEN_S)
+            return self.fabric.accepts(self.host.name, self.router)
 
         return Runtime(
             clock=self.host.monotonic,
@@ -186,4 +196,5 @@ class GatewayMember(Member):
             folder=self.folder,
             processes=SimProcesses(process),
             join=join,
+            can_connect=can_connect,
         )

@@ -436,4 +436,11 @@ MUTANTS = (
         "        self.lost.set()",
         "        pass",
     ),
+    Mutant(
+        "a session that locked up is kept",
+        "situations",
+        "zbridge/app/joining.py",
+        "await can_connect(plan) and not await returns(RECONNECTS_S)",
+        "False",
+    ),
 )

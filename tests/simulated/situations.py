@@ -220,6 +220,24 @@ def _failed_restarts(rng: random.Random, made: Made) -> None:
     made["steps"] += [_drive(healed_at - 1.5, driver) | {"for": 8.0} for driver in ("op1", "op2")]
 
 
+def _locked_up(rng: random.Random, made: Made) -> None:
+    """A gateway's session locks up while its robot is driven or latched; it may be restarted, killed or cut then."""
+    _stick(rng, made, alone=False)
+    t = rng.uniform(4.0, 6.0)
+    made["steps"] = [_drive(3.0, "op1"), _drive(3.0, "stick1"), _fault(t, "lock", target="gw1")]
+    if rng.random() < 0.4:
+        made["steps"].append({"t": 3.5, "who": "op2", "do": "latch"})
+    meanwhile = rng.choice(("restart", "kill", "pause", "reset", "cut", ""))
+    links = (
+        {"between": ["gw1", "robot" if meanwhile == "reset" else "router1"]} if meanwhile in ("reset", "cut") else {}
+    )
+    if meanwhile:
+        at = rng.choice((t + rng.uniform(1.0, 30.0), t + rng.uniform(24.0, 27.0)))
+        made["steps"].append(_fault(at, meanwhile, target="gw1", **links, **{"for": rng.uniform(1.0, 8.0)}))
+    made["steps"] += [_drive(t + s, "stick1") for s in (6.0, 20.0, 26.0)]
+    made["steps"] += [_drive(t + s, "op1") for s in (30.0, 38.0)]
+
+
 def _killed_driver(rng: random.Random, made: Made) -> None:
     """The driver's process is killed while it drives, or its bus is lost, or it is frozen."""
     kind = rng.choice(("kill", "pause", "unlink"))
@@ -253,6 +271,8 @@ SITUATIONS: tuple[Callable[[random.Random, Made], None], ...] = (
     _pushed_while_away,
     _used_up,
     _failed_restarts,
+    _locked_up,
+    _locked_up,
     _killed_driver,
     _forged_and_flooded,
 )

@@ -289,7 +289,9 @@ class Network:
         self.open(loop.process, host, port, done)
         try:
             end = await made
-        except asyncio.CancelledError:
+        except asyncio.CancelledError:  # it may just have connected
+            if made.done() and not made.cancelled() and made.exception() is None:
+                made.result().close(None)
             made.cancel()
             raise
         return SimTransport.attach(loop, factory(), StreamSocket(loop.process, end))

@@ -108,7 +108,7 @@ async def test_a_line_that_takes_nothing_is_not_ready_and_what_waits_is_unacknow
 @pytest.mark.parametrize("writing", [False, True])
 async def test_an_unplugged_device_is_lost_once_with_a_reason_and_not_within_a_write(line: Line, writing: bool) -> None:
     if writing:
-        line.link.pause()
+        line.link.pause_reading()
     line.unplug()
     if writing:
         line.link.write(b"x")

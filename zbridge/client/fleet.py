@@ -19,6 +19,7 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import (
     Acquire,
+    Battery,
     Control,
     Devices,
     FleetMessage,
@@ -261,6 +262,7 @@ class Robot:
         self.pose: Feed[Pose] = self._feed(topics.POSE)
         self.text: Feed[Text] = self._feed(topics.TEXT)
         self.image: Feed[Image] = self._feed(topics.IMAGE)
+        self.battery: Feed[Battery] = self._feed(topics.BATTERY)
         self.status: StateFeed[Status] = StateFeed(bus, keys, topics.STATUS)
         self.scanner: StateFeed[Scanner] = StateFeed(bus, keys, topics.SCANNER)
         self.map: StateFeed[Map] = StateFeed(bus, keys, topics.MAP)

@@ -11,9 +11,11 @@ from collections import Counter, defaultdict, deque
 from typing import TYPE_CHECKING, Any
 
 from tests.simulated.accounts import MAX_AGE_S, TOLERANCE, Command, Grant, motions, read
+from tests.simulated.fleet import FleetRules
 from tests.simulated.obligations import LEFT, Obligations
 from tests.simulated.released import Released
 from tests.simulated.shown import Shown
+from tests.simulated.stops import StopRules
 from tests.simulated.written import Written
 
 if TYPE_CHECKING:
@@ -55,7 +57,8 @@ class Checker:
         """By gateway, the latched stops that a successor received."""
         self.gateways = {each.name: each for each in simulation.gateways}
         self.by_host = {each.host.name: each.name for each in simulation.gateways if each.serves}
-        self._requests: dict[tuple[str, str], dict[str, Any]] = {}
+        self._requests: dict[tuple[str, str, bytes], dict[str, Any]] = {}
+        """By program, key and payload: several may come at once, after a cut."""
         self._commands: dict[tuple[str, bytes, bytes], Command] = {}
         self._recent: dict[str, deque[Command]] = {name: deque(maxlen=600) for name in self.gateways}
         self._gives: dict[str, deque[tuple[float, float]]] = {
@@ -86,8 +89,8 @@ class Checker:
             "crashed": self._on_crashed,
         }
         self.obligations = Obligations(self)
-        self.written, self.released = Written(self), Released(self)
-        self.rules = (self.written, self.released, Shown(self))
+        self.written, self.released, self.stops = Written(self), Released(self), StopRules(self)
+        self.rules = (self.written, self.released, self.stops, FleetRules(self), Shown(self))
         self.know_mode: set[str] = set()
         """The gateways that know that the robot was told to move by itself."""
         self._mode_at = 0.0
@@ -113,17 +116,19 @@ class Checker:
 
     def _on_asks(self, who: str, key: str, payload: bytes) -> None:
         if "@rpc/control/" in key:
-            self._requests[who, key] = {**read(payload), "asked at": self.world.now}
+            self._requests[who, key, payload] = {**read(payload), "asked at": self.world.now}
 
-    def _on_answers(self, gateway: str, key: str, payload: bytes, error: str, asker: str) -> None:
+    def _on_answers(self, gateway: str, key: str, payload: bytes, error: str, asker: str, asked: bytes) -> None:
         verb = key.partition("@rpc/control/")[2].partition("/")[0]
         if not verb or error != "None" or gateway not in self.gateways:
             return
-        answer, request = read(payload), self._requests.get((asker, key), {})
+        answer, request = read(payload), self._requests.get((asker, key, asked), {})
         self.counts[f"{verb} {'ok' if answer.get('ok', True) else answer.get('code')}"] += 1
         if verb.startswith("unlatch"):
-            for known in self.latches.values():
-                known.pop(request.get("id", b""), None)
+            stop_id = request.get("id", b"")
+            for name, known in self.latches.items():
+                if known.pop(stop_id, None) is not None and name != gateway:
+                    self.uncertain.add(stop_id)  # docs/control.md: it ends there only by a release at that gateway
         elif answer.get("ok") and verb in ("acquire", "takeover"):
             grant, last = Grant(gateway, asker, answer, request, self.world.now), self.current.get(gateway)
             stands = last is not None and last.ended_at is None and last.shown and not last.expires_by(self.world.now)
@@ -333,6 +338,7 @@ class Checker:
 
     def _written(self, gateway: str, data: bytes) -> None:
         self.written.written(gateway, data)
+        self.stops.written(gateway, data)
         for kind, value in motions(self.protocol, data):
             if kind == "mode" and value != 3.0:
                 continue

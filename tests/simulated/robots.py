@@ -295,8 +295,17 @@ class TcpUdpRobot(SimRobot):
         """Read the client's settings: with UDP on both sides, ask for it and sleep."""
         size = int.from_bytes(body[:4], "little")
         if self.udp and len(body) > 4 + size and body[4 + size]:
-            self.send(end, 4)
-            self._asleep_until = self.world.now + 2.0
+            starts_s = self.options.get("starts_s")
+            if starts_s is None:
+                self.start(end)
+            else:
+                self.after(starts_s, lambda: self.start(end))
+
+    def start(self, end: End) -> None:
+        """Ask for datagrams, and sleep."""
+        self.world.note(self.name, "starts datagrams", end.peer.address)
+        self.send(end, 4)
+        self._asleep_until = self.world.now + 2.0
 
     def left(self, end: End) -> None:
         self._sources = {source: each for source, each in self._sources.items() if each is not end}
@@ -378,19 +387,20 @@ class WebotsRobot(SimRobot):
         self.lossless = True
         self._free_at = 0.0
         self._bytes = b""
-        self._wheels = {0: 0.0, 1: 0.0}
+        self._motors = {0: b"left", 1: b"right"} | ({3: b"arm"} if options.get("arm") else {})
+        self._wheels = dict.fromkeys(self._motors, 0.0)
 
     def may_accept(self) -> bool:
         return super().may_accept() and not self.ends and self.world.now >= self._free_at
 
     def left(self, end: End) -> None:
         self._free_at = self.world.now + self.rng.uniform(1.0, 3.0)
-        self._bytes, self._wheels = b"", {0: 0.0, 1: 0.0}
+        self._bytes, self._wheels = b"", dict.fromkeys(self._motors, 0.0)
         self.drive(0.0)  # the controller is gone, and the simulation with it
 
     def greet(self, end: End) -> None:
-        for number, (kind, name) in enumerate(((53, b"left"), (53, b"right"), (37, b"ds0"))):
-            end.send(bytes([0, kind, number, len(name)]) + name)
+        for number, name in sorted({**self._motors, 2: b"ds0"}.items()):
+            end.send(bytes([0, 37 if number == 2 else 53, number, len(name)]) + name)
 
     def tell(self, end: End) -> None:
         self.put(end, bytes([1, 37, 2]) + struct.pack("<d", self.told + 1))

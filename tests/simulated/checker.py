@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict, deque
 from typing import TYPE_CHECKING, Any
 
-from tests.simulated.accounts import MAX_AGE_S, TOLERANCE, Command, Grant, motions, read
+from tests.simulated.accounts import SLACK_S, TOLERANCE, Command, Grant, fault_of, motions, read
 from tests.simulated.fleet import FleetRules
 from tests.simulated.obligations import LEFT, Obligations
 from tests.simulated.released import Released
@@ -21,8 +21,6 @@ from tests.simulated.written import Written
 if TYPE_CHECKING:
     from tests.simulated.scenario import Simulation
 
-SLACK_S = 0.06
-"""What is on its way through a gateway when a lease ends may be written so long."""
 NEW = "+"
 """Behind the name of a gateway's successor, until *go*."""
 WRITTEN_S = 0.02
@@ -86,7 +84,7 @@ class Checker:
             "ended": self._on_ended,
             "was suspended": self._on_suspended,
             "gives": self._on_gives,
-            "crashed": self._on_crashed,
+            "crashed": lambda who, why: self.violate("fragile", f"{who} crashed: {why}"),
         }
         self.obligations = Obligations(self)
         self.written, self.released, self.stops = Written(self), Released(self), StopRules(self)
@@ -366,39 +364,11 @@ class Checker:
                 break
             if (command.kind == "mode") is not (kind == "mode") or abs(command.value - value) > tolerance:
                 continue
-            reason = self._fault_of(command, gateway)
+            reason = fault_of(command, self.grants.get(command.lease or b""), gateway, now)
             if reason is None:
                 return None
             worst = worst or (reason[0], f"{gateway} wrote {command}: {reason[1]}")
         return worst or ("unknown-motion", f"{gateway} wrote {kind} {value:.5f}, which nobody commanded")
-
-    def _fault_of(self, command: Command, gateway: str) -> tuple[str, str] | None:
-        now, received = self.world.now, command.received[gateway]
-        grant = self.grants.get(command.lease or b"")
-        if grant is None or grant.gateway != gateway:
-            return "no-lease", "without a lease of this gateway"
-        if command.who != grant.asker:
-            return "forged", f"{command.who} used the lease of {grant.asker}"
-        if grant.over(now, SLACK_S):
-            return "lease-ended", f"its lease ended {now - (grant.ended_at or 0):.2f} s ago: {grant.why}"
-        if received < grant.at:
-            return "no-lease", "received before its lease"
-        if command.forbidden:
-            return "neutral-first", "after the deadman, without a neutral"
-        late_s = received - command.given_at - grant.base_s
-        if command.dated and late_s > min(MAX_AGE_S, grant.deadman_s) + 0.05:
-            return "stale", f"it came {late_s:.2f} s late"
-        if command.called_off is not None and now > command.called_off + SLACK_S:
-            return "called-off", f"it was called off {now - command.called_off:.2f} s ago"
-        if command.kind == "mode":
-            return ("stale", "long ago") if now - received > 2.5 else None
-        given_at = command.given_at + grant.base_s if command.dated else received
-        if now - given_at > grant.deadman_s + 0.1:
-            return "deadman", f"given {now - given_at:.2f} s ago, deadman {grant.deadman_s:g} s"
-        return None
-
-    def _on_crashed(self, who: str, why: str) -> None:
-        self.violate("fragile", f"{who} crashed: {why}")
 
     # The end
 

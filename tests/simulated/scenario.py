@@ -29,7 +29,8 @@ from tests.simulated.hq_programs import HQ_PROGRAMS, HqProgram
 from tests.simulated.members import ROBOT, DriverMember, Member
 from tests.simulated.net import Network, Paths
 from tests.simulated.restart_rules import RestartRules
-from tests.simulated.robots import ROBOTS
+from tests.simulated.robots import AlfRobot, SimRobot, TcpUdpRobot
+from tests.simulated.webots_robot import WebotsRobot
 
 HEAL_S = 14.0
 """Seconds without faults before the robot must be drivable."""
@@ -37,6 +38,7 @@ PROBE_S = 8.0
 LEAVE_S = 4.0
 ROBOT_PORT = 11001
 HQ_PORT = 12000
+ROBOTS: dict[str, type[SimRobot]] = {"tcpudp": TcpUdpRobot, "alf": AlfRobot, "wc2ec": WebotsRobot}
 
 
 class Outcome:

@@ -141,7 +141,8 @@ def _called_off(rng: random.Random, made: Made) -> None:
     made["drivers"][0]["options"] = {}  # the client that chooses modes
     then = rng.choice((None, None, "manual"))
     drive = _drive(5.0, "op1", mode="autonomous", silent=True, then=then, hz=rng.choice((20.0, 50.0)), holds=1.0)
-    made["steps"] = [_fault(4.0, "threads", target="gw1", by=0.8, **{"for": 6.0}), drive | {"for": 0.01}]
+    slow = _fault(4.0, "threads", target="gw1", by=rng.choice((0.4, 0.4, 0.8)), **{"for": 6.0})
+    made["steps"] = [slow, drive | {"for": 0.01}]
 
 
 def _busy_program(rng: random.Random, made: Made) -> None:
@@ -232,6 +233,7 @@ SITUATIONS: tuple[Callable[[random.Random, Made], None], ...] = (
     _two_owners,
     _killed_in_mode_3,
     _killed_in_mode_3,
+    _called_off,
     _called_off,
     _busy_program,
     _pushed_while_away,

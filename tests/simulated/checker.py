@@ -126,7 +126,7 @@ class Checker:
             stop_id = request.get("id", b"")
             for name, known in self.latches.items():
                 if known.pop(stop_id, None) is not None and name != gateway:
-                    self.uncertain.add(stop_id)  # docs/control.md: it ends there only by a release at that gateway
+                    self.uncertain.add(stop_id)  # that gateway has still to learn of it
         elif answer.get("ok") and verb in ("acquire", "takeover"):
             grant, last = Grant(gateway, asker, answer, request, self.world.now), self.current.get(gateway)
             stands = last is not None and last.ended_at is None and last.shown and not last.expires_by(self.world.now)

@@ -53,22 +53,18 @@ GO_S = 30.0
 """Longest wait of a successor for :class:`Go`; the other process needs milliseconds, or gives up."""
 
 
-Describe = Callable[[Parcel], HandoverState]
-"""``describe(parcel)``: what is handed over, once all parts are suspended."""
-
-
 class Outgoing:
     """The gateway that goes. ``successor``: starts the process that comes.
 
-    ``parts``: gives what there is to hand over now. ``describe``: writes all of it. ``processes``, ``kernel``: of this
-    machine, or simulated ones.
+    ``parts``: gives what there is to hand over now. ``describe``: exports all of it to a parcel.
+    ``processes``, ``kernel``: of this machine, or simulated ones.
     """
 
     def __init__(
         self,
         successor: Successor,
         parts: Callable[[], Sequence[Transferable]],
-        describe: Describe,
+        describe: Callable[[Parcel], HandoverState],
         processes: Processes = PROCESSES,
         kernel: Kernel = KERNEL,
     ) -> None:

@@ -71,7 +71,7 @@ async def test_what_was_written_before_closing_arrives_and_a_lost_link_takes_cal
         assert (pair.near.data, pair.near.reason) == (b"last words", "closed by peer")
         assert not pair.here.ready
         pair.here.write(b"x")
-        for call in (pair.here.pause, pair.here.resume, pair.here.close, pair.here.abort):
+        for call in (pair.here.pause_reading, pair.here.resume_reading, pair.here.close, pair.here.abort):
             call()
         await asyncio.sleep(0)
         assert pair.near.calls == ["attached", "received", "lost"]

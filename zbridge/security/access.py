@@ -19,7 +19,7 @@ from typing import Any, Literal
 import msgspec
 
 from zbridge.fleet.topics import CMD_STOP, size_bounds
-from zbridge.security.roles import Member, Role, Roles
+from zbridge.security.roles import Member, Roles
 
 STOPS_HZ = 1000.0
 """Stops a second that one member may send to one robot.
@@ -159,18 +159,6 @@ GRANTS: Mapping[Column, tuple[Grant, ...]] = {
     "recorder": _RECORDER,
     "router": (Grant(Keys.EVERYTHING, tuple(MessageKind)),),
 }
-
-NEEDED: Mapping[str, Role] = {
-    "run, a robot": "gateway",
-    "run, HQ programs only": "hq",
-    "replay": "gateway",
-    "ls, echo, stop, top, foxglove, ros2, console": "viewer",
-    "drive, unlatch, mark; foxglove, ros2 and console that drive": "operator",
-    "drive --takeover, unlatch --all, restart, doctor": "supervisor",
-    "record": "recorder",
-    "router": "router",
-}
-"""Which role each command needs at least."""
 
 
 def column(member: Member) -> Column:

@@ -12,6 +12,7 @@ import math
 import random
 import socket
 import time
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -47,8 +48,7 @@ from zbridge.ros2 import (
     read_attachment,
     types_of,
 )
-from zbridge.simulation.simulator import CATCH_UP_S, STEP_S
-from zbridge.simulation.timing import Ticker
+from zbridge.simulation.simulator import STEP_S, live
 from zbridge.simulation.world import Body, Grid, cast
 from zbridge.transport import Conversation
 from zbridge.transport.samples import serve
@@ -148,7 +148,6 @@ class RosMachine:
         return f"<RosMachine {self.body} {self.forward:+.2f} m/s {self.turn:+.2f} rad/s>"
 
     def take(self, twist: Any) -> None:
-        """Obey one command."""
         forward, turn = float(twist.linear.x), float(twist.angular.z)
         if math.isfinite(forward) and math.isfinite(turn):
             self.forward = max(-FASTEST_M_S, min(FASTEST_M_S, forward))
@@ -156,7 +155,6 @@ class RosMachine:
             self._commanded_s = self._lived_s
 
     def step(self, dt: float) -> None:
-        """Advance by ``dt`` seconds."""
         self._lived_s += dt
         if self._lived_s - self._commanded_s > TIMEOUT_S:
             self.forward = self.turn = 0.0
@@ -271,7 +269,7 @@ async def simulate(simulation: Simulation) -> None:
     async with serve(address, conversation):
         simulation.ready((address,))
         try:
-            await _live(machine, session, conversation, types)
+            await live(partial(_step, machine, session, conversation, types))
         finally:
             conversation.close("simulator ended")
 
@@ -284,21 +282,17 @@ def _with_port(address: Address) -> Address:
         return Address(address.host, int(free.getsockname()[1]))
 
 
-async def _live(machine: RosMachine, session: NodeRole, conversation: Conversation, types: Types) -> None:
-    ticker, steps = Ticker(STEP_S, catch_up_s=CATCH_UP_S), 0
-    while True:
-        await ticker.tick()
-        steps += 1
-        machine.step(STEP_S)
-        if session.state is not State.ESTABLISHED:
-            continue
-        seconds, nanoseconds = divmod(time.time_ns(), _NS_PER_S)
-        stamp = types.message("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
-        for name, (measure, frame, every) in _SENT.items():
-            if steps % every == 0:
-                header = types.message("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
-                session.publish(name, measure(machine, header))
-        conversation.pump()
+def _step(machine: RosMachine, session: NodeRole, conversation: Conversation, types: Types, steps: int) -> None:
+    machine.step(STEP_S)
+    if session.state is not State.ESTABLISHED:
+        return
+    seconds, nanoseconds = divmod(time.time_ns(), _NS_PER_S)
+    stamp = types.message("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
+    for name, (measure, frame, every) in _SENT.items():
+        if steps % every == 0:
+            header = types.message("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+            session.publish(name, measure(machine, header))
+    conversation.pump()
 
 
 _DIALECTS = {"twist": TWIST, "stamped": TWIST_STAMPED}

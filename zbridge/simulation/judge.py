@@ -1,7 +1,9 @@
 """What every judge records: violations, events and the cause of its death. Sans-IO; knows no protocol.
 
-A judge is a simulated peer as fragile as the deployed ones. Judges share their scaffold (this module, ``fragile``,
-``hq_program``, ``sockets`` and ``timing``), and no code with the gateway that they judge.
+A judge is a simulated peer as fragile as the deployed ones: it records each violation of what the page of its protocol
+demands, and dies of what kills or cripples the deployed programs. Section names in its docstrings are those of that
+page. Judges share their scaffold (this module, ``fragile``, ``hq_program``, ``sockets`` and ``timing``), and no code
+with the gateway that they judge, so that an error there cannot hide here: not its messages, session or translation.
 """
 
 from __future__ import annotations

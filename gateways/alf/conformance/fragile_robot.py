@@ -52,7 +52,7 @@ class FragileVehicle(FragileServer):
         chance = Chances(seed)
         self.machine = machine or JudgedVehicle(chance["machine"], points)
         self._times, self._repeats = times, Repeats(times)
-        self._reader = wire.reader(dialect, {wire.DRIVE, wire.END} if drive else {wire.END}, wire.FULL_PERCENT)
+        self._reader = wire.CommandReader(dialect, {wire.DRIVE, wire.END} if drive else {wire.END})
         self._phase = Phase.WAITING
         self._sequence = 0
         self._booted_s = time.monotonic() - chance["clock"].uniform(10, 3600)
@@ -95,7 +95,6 @@ class FragileVehicle(FragileServer):
         self._phase = Phase.OVER
 
     def _finish(self, why: str) -> None:
-        """Leave the connection."""
         self._event(why)
         self._shut()
         self._phase, self._conn = Phase.OVER, None

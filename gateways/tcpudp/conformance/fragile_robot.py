@@ -85,7 +85,6 @@ class FragileRobot(FragileServer):
         self._forget()
 
     def _forget(self) -> None:
-        """Forget the HQ."""
         self._reads = wire.Reads()
         self._ignores_next = False
         self._awake = asyncio.Event()
@@ -122,7 +121,6 @@ class FragileRobot(FragileServer):
         self._start(self._converse(conn))
 
     def cut(self) -> None:
-        """Break the connection."""
         self._shut()
 
     async def _converse(self, conn: socket.socket) -> None:

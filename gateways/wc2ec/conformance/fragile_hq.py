@@ -198,8 +198,10 @@ class FragileExternalController(HqProgram):
 
     def _measure(self, message: ParsedWc2EcMessage, value: float, raw: str) -> None:
         number = message.number
-        if self.dialect == "draft":
-            self._unasked(number, raw)
+        if self.dialect == "draft":  # 128, 129
+            disabled_s = time.monotonic() - self._disabled.get(number, -math.inf)
+            if number not in self.enabled and disabled_s > self._flight_s:
+                self._violate(f"data of sensor {number}, which is not enabled: {raw}")
         elif number not in self.devices:
             self._violate(f"data of number {number}, which is not registered: {raw}")
         elif self.devices[number][0] != message.node_type:
@@ -210,9 +212,3 @@ class FragileExternalController(HqProgram):
         self.ready.set()
         self.values[number] = value
         self.counts[number] = self.counts.get(number, 0) + 1
-
-    def _unasked(self, number: int, raw: str) -> None:
-        """Judge data of a sensor that is not enabled ("Dialect `draft`" 128, 129)."""
-        disabled_s = time.monotonic() - self._disabled.get(number, -math.inf)
-        if number not in self.enabled and disabled_s > self._flight_s:
-            self._violate(f"data of sensor {number}, which is not enabled: {raw}")

@@ -377,7 +377,9 @@ async def test_a_datagram_from_another_socket_is_noted() -> None:
 async def test_the_simulator_logs_violations_and_says_what_it_died_of(caplog, capsys) -> None:
     bound: asyncio.Future[tuple[Address, ...]] = asyncio.get_running_loop().create_future()
     simulation = Simulation((Address("127.0.0.1", 0),), ready=bound.set_result)
-    task = asyncio.create_task(FragileRobot(version="1.3", udp=False, seed=3).simulate(simulation))
+    task = asyncio.create_task(
+        FragileRobot(version="1.3", udp=False, seed=3).simulate(simulation.addresses, simulation.ready)
+    )
     hq = Hq(None, Peer((await bound)[0].port), task)
     with contextlib.closing(hq.peer), contextlib.closing(hq.udp):
         await hq.connect("")

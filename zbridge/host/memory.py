@@ -84,7 +84,6 @@ class MemoryWriter:
         self._area = area
 
     def close(self) -> None:
-        """Unmap the memory."""
         self._map.close()
 
 

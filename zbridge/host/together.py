@@ -148,8 +148,3 @@ class Together:
                 await Gateway(plan, metrics).run_on(bus, self._neighbourhood)
         finally:
             await bus.close()
-
-
-async def run_together(plans: Mapping[str, GatewayPlan], host: HostSettings | None = None) -> None:
-    """Serve the robots of these plans in this process until cancelled; see :class:`Together`."""
-    await Together(plans, host or HostSettings(together=True)).run()

@@ -13,11 +13,11 @@ import socket
 import sys
 from abc import abstractmethod
 from collections.abc import Callable, Coroutine, Iterable
-from typing import Any, Unpack
+from typing import Any
 
 import msgspec
 
-from zbridge.simulation.judge import Bounds, Ended, Judge, MessageReader
+from zbridge.simulation.judge import Ended, Judge, MessageReader
 from zbridge.simulation.sockets import bind_tcp, send_at_once
 
 _UNANSWERED = 16
@@ -35,8 +35,8 @@ class FragilePeer(Judge):
     _phase: enum.Enum
     _reader: MessageReader[Any]
 
-    def __init__(self, **bounds: Unpack[Bounds]) -> None:
-        super().__init__(**bounds)
+    def __init__(self) -> None:
+        super().__init__()
         self.ending = ""
         """Why it ended by itself, "" if it did not."""
         self._over = asyncio.Event()
@@ -164,7 +164,7 @@ class FragileServer(FragilePeer):
                 if len(ports) == len(servers):
                     ready(tuple(msgspec.structs.replace(at, port=ports[one]) for one, at in servers.items()))
 
-            server._note = server._note or log_violations()
+            server.note = server.note or log_violations()
             await server.serve(servers[server].host, servers[server].port, bound)
             if server.ending:
                 print_line(server.ending)

@@ -9,10 +9,9 @@ import asyncio
 import contextlib
 from abc import abstractmethod
 from collections.abc import Iterable
-from typing import ClassVar, Unpack
+from typing import ClassVar
 
 from zbridge.simulation.fragile import FragilePeer, log_violations, print_line
-from zbridge.simulation.judge import Bounds
 from zbridge.simulation.sockets import connected
 
 NEUTRAL_S = 1.0
@@ -35,8 +34,8 @@ class HqProgram(FragilePeer):
     OPTIONS: ClassVar[Iterable[tuple[int, int, int]]] = ()
     """Options of its socket."""
 
-    def __init__(self, **bounds: Unpack[Bounds]) -> None:
-        super().__init__(**bounds)
+    def __init__(self) -> None:
+        super().__init__()
         self.connected = asyncio.Event()
 
     async def run(self, host: str, port: int) -> None:
@@ -55,7 +54,7 @@ class HqProgram(FragilePeer):
         drive: forward and turn that it drives, once it has sent neutral for a while; None: it does not drive. A
         cancelled program sends neutral before it leaves. Raises OSError if nobody listens.
         """
-        self._note = self._note or log_violations()
+        self.note = self.note or log_violations()
         print_line(f"connecting to {host}:{port}")
         running, ready = asyncio.ensure_future(self.run(host, port)), asyncio.Event()
         beside = [asyncio.ensure_future(self._print(ready))]

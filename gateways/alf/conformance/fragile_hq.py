@@ -8,7 +8,7 @@ import socket
 import time
 from collections import deque
 from collections.abc import Iterable
-from typing import Literal, NoReturn, Unpack
+from typing import Literal, NoReturn
 
 from gateways.alf.conformance import parser as wire
 from gateways.alf.conformance.parser import (
@@ -25,7 +25,7 @@ from gateways.alf.conformance.parser import (
 )
 from zbridge.simulation.fragile import Work
 from zbridge.simulation.hq_program import HqProgram
-from zbridge.simulation.judge import Bounds, Ended
+from zbridge.simulation.judge import Ended
 from zbridge.simulation.timing import Ticker
 
 Serves = Literal["auto", "drive", "laser", "both"]
@@ -66,11 +66,10 @@ class FragileAlfHq(HqProgram):
         stops_reading_after: int | None = None,
         answer_s: float = 2.0,
         flight_s: float = 1.0,
-        **bounds: Unpack[Bounds],
     ) -> None:
         if dialect not in FULL or serves not in ("auto", *_SERVED):
             raise ValueError(f"no such HQ: dialect {dialect!r}, serves {serves!r}")
-        super().__init__(**bounds)
+        super().__init__()
         self.dialect: Dialect = dialect
         self.scanner: Fields | None = None
         """The last message 2."""

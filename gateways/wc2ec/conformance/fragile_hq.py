@@ -7,13 +7,13 @@ import math
 import struct
 import time
 from collections.abc import Iterable
-from typing import NoReturn, Unpack
+from typing import NoReturn
 
 from gateways.wc2ec.conformance import parser as wire
 from gateways.wc2ec.conformance.parser import ControllerReader, Dialect, ParsedWc2EcMessage
 from zbridge.simulation.fragile import Work
 from zbridge.simulation.hq_program import HqProgram
-from zbridge.simulation.judge import Bounds, Ended, show
+from zbridge.simulation.judge import Ended, show
 
 MOTOR_TYPES = (53, 46)
 """Rotational and linear motors; the numbers move with the Webots version."""
@@ -35,11 +35,10 @@ class FragileExternalController(HqProgram):
         dialect: Dialect = "deployed",
         split: bool = False,
         flight_s: float = 0.5,
-        **bounds: Unpack[Bounds],
     ) -> None:
         if dialect not in wire.DATA:
             raise ValueError(f"no such controller: dialect {dialect!r}")
-        super().__init__(**bounds)
+        super().__init__()
         self.dialect: Dialect = dialect
         self.ready = asyncio.Event()
         """Set by the first data after the connection: before that it does nothing ("The gateway as Webots ...")."""

@@ -301,9 +301,12 @@ async def test_an_end_goes_behind_a_measurement_that_is_being_sent_and_none_wher
     assert (len(said) == size, said.endswith(b"\xff\x01")) == (ended, ended)
 
 
-async def test_what_is_kept_is_bounded_and_nothing_is_ended_before_anybody_came() -> None:
-    noted: list[str] = []
-    vehicle = quick(keep=2, note=noted.append)
+async def test_what_is_kept_is_bounded_and_nothing_is_ended_before_anybody_came(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(FragileVehicle, "KEEP", 2)
+    vehicle, noted = quick(), list[str]()
+    vehicle.note = noted.append
     await vehicle.end()
     async with connected(vehicle) as hq:
         await hq.say("7;8;9;3|0|0|0|0;")

@@ -15,7 +15,7 @@ from gateways.tcpudp.conformance.fragile_robot import FragileRobot
 from gateways.tcpudp.conformance.machine import Loss, Quirks
 from gateways.tcpudp.conformance.parser import FeatureFlag, RobotTimes
 from tests import captures
-from tests.conformance.scene import LONG_S, Peer, serving, table, until
+from tests.conformance.scene import LONG_S, Peer, bounded, serving, table, until
 from tests.gateways.tcpudp.conformance.udp_scene import NAMES as SHARED
 from tests.gateways.tcpudp.conformance.udp_scene import UdpScene
 from zbridge.protocol import Address, Simulation
@@ -123,7 +123,7 @@ async def facing(robot: FragileRobot) -> AsyncIterator[Hq]:
 def quick(version: str = "1.3", udp: bool = False, **options: Any) -> FragileRobot:
     options = {"client_id": CLIENT, "times": QUICK, **options}
     quirks = Quirks(**{name: options.pop(name) for name in Quirks.__struct_fields__ if name in options})
-    return FragileRobot(version=version, udp=udp, seed=1, quirks=quirks, **options)
+    return bounded(FragileRobot, {"version": version, "udp": udp, "seed": 1, "quirks": quirks, **options})
 
 
 ROBOTS: dict[str, dict[str, Any]] = {

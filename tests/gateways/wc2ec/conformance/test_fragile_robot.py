@@ -15,7 +15,7 @@ import pytest
 from gateways.wc2ec.conformance.fragile_robot import FragileWebotsController
 from gateways.wc2ec.conformance.machine import JudgedWebots
 from gateways.wc2ec.conformance.parser import DEFAULT, DeviceKind, Dialect, ExternalReader, SimulatedDevice, Wc2EcTimes
-from tests.conformance.scene import LONG_S, Peer, Scene, serving, table, until
+from tests.conformance.scene import LONG_S, Peer, Scene, bounded, serving, table, until
 from zbridge.protocol import Address
 
 QUICK = Wc2EcTimes(step_s=0.005, register_s=0.0, part_s=5)
@@ -120,7 +120,7 @@ async def facing(controller: FragileWebotsController) -> AsyncIterator[Talk]:
 
 
 def quick(dialect: Dialect = "deployed", **options: Any) -> FragileWebotsController:
-    return FragileWebotsController(dialect, **{"times": QUICK, **options})
+    return bounded(FragileWebotsController, {"dialect": dialect, "times": QUICK, **options})
 
 
 JUDGES: dict[str, dict[str, Any]] = {

@@ -124,7 +124,6 @@ class NodeRole(Session[Any]):
             self.send_first(KeyedSample(SampleKind.ANNOUNCE, token))
 
     def publish(self, name: str, message: Any) -> None:
-        """Put a message on one of the robot's topics."""
         publisher = self._publishers.get(name)
         if publisher is None:
             raise ProtocolError(f"{name}: not announced yet")
@@ -179,7 +178,6 @@ class RosMachine:
         )
 
     def odometry(self, header: Any) -> Any:
-        """Say where it is and how it moves."""
         make, body = self._types.message, self.body
         pose = make(
             "geometry_msgs/msg/Pose",
@@ -200,7 +198,6 @@ class RosMachine:
         )
 
     def imu(self, header: Any) -> Any:
-        """Measure its turning and gravity."""
         make = self._types.message
         return make(
             "sensor_msgs/msg/Imu",
@@ -211,7 +208,6 @@ class RosMachine:
         )
 
     def battery(self, header: Any) -> Any:
-        """Say how full the battery is."""
         level = max(0.0, 1.0 - self._lived_s / EMPTY_S)
         voltage = EMPTY_V + level * (FULL_V - EMPTY_V)
         return self._types.message(

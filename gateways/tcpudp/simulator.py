@@ -72,7 +72,6 @@ class Vehicle:
 
     @property
     def moving(self) -> bool:
-        """True while it moves as commanded."""
         return any(self._motion)
 
     def step(self, dt: float) -> None:

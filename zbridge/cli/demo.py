@@ -64,7 +64,6 @@ class Watch:
         self.rows = {robot: Row() for robot in robots}
 
     def take(self, sample: Sample) -> None:
-        """Take one sample from the bus."""
         split = split_key(sample.key)
         row = self.rows.get(split[1]) if split else None
         if split is None or row is None:

@@ -118,9 +118,6 @@ class Addresses:
     def __init__(self) -> None:
         self._taken: dict[str, tuple[Path, bool]] = {}
 
-    def __repr__(self) -> str:
-        return f"<Addresses {len(self._taken)}>"
-
     def add(self, path: Path, forms: Iterable[str], shares: bool) -> None:
         """Enter the addresses of a file; raise ConfigError where another file has one of them."""
         forms = list(forms)

@@ -176,9 +176,6 @@ class Follower:
         """Files whose check failed, and when."""
         self._reported = dict(reported or {})
 
-    def __repr__(self) -> str:
-        return f"<Follower of {', '.join(map(str, self._sources))}>"
-
     def poll(self, running: Mapping[Path, RobotFile], *, twice: bool = True) -> Changes:
         """Read what may have changed; raise ConfigError if a directory cannot be read.
 

@@ -62,9 +62,6 @@ class Together:
         self._neighbourhood = Neighbourhood(host.share, bytearray(SHARED_READ_BYTES))
         self._tasks: dict[str, asyncio.Task[None]] = {}
 
-    def __repr__(self) -> str:
-        return f"<Together {len(self._tasks)} gateways>"
-
     def __len__(self) -> int:
         return len(self._tasks)
 

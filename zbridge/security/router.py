@@ -97,9 +97,6 @@ class ZenohWarnings:
         self._logged: dict[str, tuple[float, int]] = {}
         """By warning, when it was logged, and how often it came since."""
 
-    def __repr__(self) -> str:
-        return f"<ZenohWarnings {len(self._logged)}>"
-
     def take(self, line: str) -> None:
         level, text = in_our_words(line)
         if text not in self._logged and len(self._logged) >= KINDS:

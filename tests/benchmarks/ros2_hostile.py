@@ -21,10 +21,10 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from tests.benchmarks.harness import cpu_s
-from tests.e2e import ros_robot
 from tests.e2e.conftest import repeated
-from tests.e2e.processes import Part
-from tests.e2e.ros2_scene import FRAGILE, SCAN, TWIST, FragileInFleet, RosScene
+from tests.e2e.measured import ros_robot
+from tests.e2e.rigs.processes import Part
+from tests.e2e.rigs.ros2_scene import FRAGILE, SCAN, TWIST, FragileInFleet, RosScene
 from tests.views.ros2.judge import DEFAULT, Publisher, Ros
 
 STRING, TRIGGER, SET_BOOL = "std_msgs/msg/String", "std_srvs/srv/Trigger", "std_srvs/srv/SetBool"

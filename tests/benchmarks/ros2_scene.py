@@ -23,7 +23,7 @@ import zenoh
 
 from tests.benchmarks import alf_wire
 from tests.e2e.conftest import Gateway, configuration, device, end, start
-from tests.e2e.processes import Part
+from tests.e2e.rigs.processes import Part
 from tests.ports import free_port
 from tests.views.ros2.judge import Ros
 

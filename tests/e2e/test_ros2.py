@@ -14,8 +14,8 @@ import pytest
 import zenoh
 
 from tests.e2e.conftest import Gateway, configuration, device, repeated, start, until
-from tests.e2e.robots import STOP, Robot
-from tests.e2e.ros2_scene import GRID, SCAN, STAMPED, TWIST, RosScene, pushed
+from tests.e2e.rigs.robots import STOP, Robot
+from tests.e2e.rigs.ros2_scene import GRID, SCAN, STAMPED, TWIST, RosScene, pushed
 from tests.ports import free_port
 from tests.views.ros2.judge import Publisher, Ros
 

@@ -68,7 +68,7 @@ class Hostile(FakeBus):
         return await super().ask(key_expr, payload, timeout_s=timeout_s)
 
     def join(self, zid: str) -> Hostile:
-        return Hostile(zid, self._shared)
+        return Hostile(zid, self.network)
 
 
 @pytest.fixture

@@ -174,7 +174,7 @@ async def settle() -> None:
 
 def subscriptions(bus: FakeBus, key: str) -> int:
     """Count the subscriptions of this very key."""
-    return sum(key_expr == key for key_expr, _ in bus._shared.subscribers)
+    return sum(key_expr == key for key_expr, _ in bus.network.subscribers)
 
 
 def tokens(bus: FakeBus, name: str = "r1") -> list[str]:
@@ -185,4 +185,4 @@ def tokens(bus: FakeBus, name: str = "r1") -> list[str]:
 def numbered_tokens(bus: FakeBus, name: str = "r1") -> list[str]:
     """List the liveliness tokens of programs that drive."""
     prefix = f"fleet/{name}/@alive/"
-    return [token.removeprefix(prefix) for token in bus._shared.tokens if token.startswith(prefix + "operator.")]
+    return [token.removeprefix(prefix) for token in bus.network.tokens if token.startswith(prefix + "operator.")]

@@ -241,7 +241,7 @@ LOOKS: dict[str, Callable[[Scene], str]] = {
     "holder": lambda scene: scene.gateway.report().holder or NOTHING,
     "held": lambda scene: str(scene.program.intent.held),
     "active": lambda scene: str(scene.program.active),
-    "tokens": lambda scene: " ".join(key.removeprefix(KEYS.alive("")) for key in scene.bus._shared.tokens) or NOTHING,
+    "tokens": lambda scene: " ".join(key.removeprefix(KEYS.alive("")) for key in scene.bus.network.tokens) or NOTHING,
     "violations": lambda scene: " ".join(scene.gateway.refused) or NOTHING,
 }
 

@@ -46,7 +46,7 @@ class Scene:
 
     @property
     def subscribed(self) -> list[str]:
-        return sorted(KEYS.path(key) for key, _ in self.bus._shared.subscribers)
+        return sorted(KEYS.path(key) for key, _ in self.bus.network.subscribers)
 
 
 @pytest.fixture

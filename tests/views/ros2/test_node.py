@@ -54,13 +54,13 @@ class Scene:
 
     def put(self, path: str, payload: bytes) -> None:
         """Let the robot publish; the fake bus calls whoever subscribed on this thread."""
-        for key_expr, handler in tuple(self.fleet._shared.subscribers):
+        for key_expr, handler in tuple(self.fleet.network.subscribers):
             if key_expr == f"fleet/r1/{path}":
                 handler(Sample(key_expr, payload))
 
     def numbers(self, name: str) -> list[int]:
         """Give the numbers of what was put on a topic, in order."""
-        shown = [sample.attachment for sample in self.ros._shared.history if sample.key.startswith(f"0/r1/{name}/")]
+        shown = [sample.attachment for sample in self.ros.network.history if sample.key.startswith(f"0/r1/{name}/")]
         return [read_attachment(attachment).number for attachment in shown]
 
 
@@ -93,7 +93,7 @@ async def test_nothing_is_read_that_nobody_listens_to(scene: Scene) -> None:
     scene.listen("scan", False)
     scene.put("scan", SCAN)
     assert scene.numbers("scan") == [1]
-    read = {key for key, _ in scene.fleet._shared.subscribers}
+    read = {key for key, _ in scene.fleet.network.subscribers}
     assert read == {"fleet/r1/devices"}
 
 
@@ -156,11 +156,11 @@ def devices(*names: str) -> Sample:
 
 async def test_a_robot_whose_sensors_get_other_names_has_topics_of_those_it_has_now(scene: Scene) -> None:
     scene.node._on_devices(devices("a", "b"))
-    before = len(scene.ros._shared.tokens)
+    before = len(scene.ros.network.tokens)
     scene.listen("range/a")
     for number in range(20):
         scene.node._on_devices(devices(f"a{number}", f"b{number}"))
-    assert len(scene.ros._shared.tokens) == before
+    assert len(scene.ros.network.tokens) == before
     assert {name for name in scene.node._outlets if name.startswith("range/")} == {"range/a19", "range/b19"}
     assert "range/a" not in scene.node._listened
 
@@ -171,8 +171,8 @@ async def test_what_is_told_after_the_end_declares_nothing(scene: Scene) -> None
     for name, outlet in outlets.items():
         scene.node._on_listened(name, outlet, True)
     scene.node._on_devices(devices("ghost"))
-    assert scene.fleet._shared.subscribers == []
-    assert scene.ros._shared.tokens == []
+    assert scene.fleet.network.subscribers == []
+    assert scene.ros.network.tokens == []
     assert scene.node._timer is None
 
 
@@ -180,6 +180,6 @@ async def test_readings_of_all_sensors_come_by_one_subscription_each_to_its_topi
     scene.node._on_devices(devices("a", "b"))
     for name in ("range/a", "range/b"):
         scene.listen(name)
-    ((_, take),) = [(key, take) for key, take in scene.fleet._shared.subscribers if key == "fleet/r1/sensor/*"]
+    ((_, take),) = [(key, take) for key, take in scene.fleet.network.subscribers if key == "fleet/r1/sensor/*"]
     take(Sample("fleet/r1/sensor/b", encode(Reading(1.0, "distance", 1))))
     assert (scene.numbers("range/a"), scene.numbers("range/b")) == ([], [1])

@@ -57,7 +57,7 @@ class Scene:
 
     def unheard(self, *tokens: str) -> None:
         """Change the publishers that are there, and tell nobody."""
-        there = self.bus._shared.tokens
+        there = self.bus.network.tokens
         there[:] = [*(token for token in there if "/MP/" not in token), *tokens]
 
 
@@ -109,7 +109,7 @@ async def test_a_publisher_that_goes_while_the_answer_is_on_its_way_is_not_enter
     endpoint = scene.endpoint()
 
     async def alive(_: str) -> list[str]:
-        scene.bus._shared.tell(endpoint.token(), False)
+        scene.bus.network.notify(endpoint.token(), False)
         return [endpoint.token()]
 
     monkeypatch.setattr(scene.bus, "alive", alive)
@@ -227,7 +227,7 @@ async def test_a_robot_that_somebody_stops_is_owed_a_zero_by_its_publishers() ->
     assert told.level == WARN
     assert "the robot was stopped: send a zero, or nothing for a second, then drive" in told.message
     publisher.close()
-    assert scene.fleet._shared.subscribers == [], "without publishers nobody looks"
+    assert scene.fleet.network.subscribers == [], "without publishers nobody looks"
     await scene.teleop.close()
 
 

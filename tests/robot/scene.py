@@ -152,7 +152,7 @@ class Program:
     def command(self, name: str, fields: dict[str, Any] | bytes = NEUTRAL) -> None:
         """Command the robot, with the lease where there is one and the command needs it."""
         payload = fields if isinstance(fields, bytes) else packed(fields)
-        needed = name.split("/")[0] in NEED_A_LEASE
+        needed = name.split("/", maxsplit=1)[0] in NEED_A_LEASE
         self.put(name, payload, self.held.attachment(name, payload) if needed and self.held is not None else None)
 
     def put(self, name: str, fields: dict[str, Any] | bytes, attachment: bytes | None) -> None:

@@ -301,7 +301,7 @@ class ForkClient:
             if stamp == old.stamp:
                 self._refused = None
             self.unsettled = stamp != old.stamp and not stamp.settled
-            if stamp == old.stamp or stamp == self._refused or not stamp.settled:
+            if stamp in (old.stamp, self._refused) or not stamp.settled:
                 return
             log.info("the installation has changed: its code is loaded")
         try:

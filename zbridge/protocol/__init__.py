@@ -1,5 +1,7 @@
-"""What the author of a protocol imports, beside :mod:`zbridge.wire` (messages as bytes) and :mod:`zbridge.fleet`
-(messages on the bus). Sans-IO: knows no event loop, socket, clock, bus, and no robot in particular.
+"""What the author of a protocol imports.
+
+Beside it :mod:`zbridge.wire` (messages as bytes) and :mod:`zbridge.fleet` (messages on the bus). Sans-IO: knows no
+event loop, socket, clock, bus, and no robot in particular.
 
 =============== ===================================================================================================
 plugin          :class:`Protocol`: what an entry point names. :class:`Robot` and :class:`HqSide`: its two sides, with

@@ -96,7 +96,7 @@ class Scene(HqScene):
         self.there = False
         self.play(script)
 
-    def play(self, script: str) -> None:
+    def play(self, script: str) -> None:  # noqa: C901, PLR0912
         """Do the steps of a script.
 
         ``table CAR rear/9/distance``, ``is wc2ec`` (established), ``ready`` (both, with a client), ``robot goes``,

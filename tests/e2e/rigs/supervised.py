@@ -22,6 +22,7 @@ from zbridge.app import until_signal
 from zbridge.cli import set_up_log
 from zbridge.cli.fork_server import run
 from zbridge.host.fd_channel import FdChannel
+from zbridge.host.fork_client import ForkClient
 from zbridge.host.fork_server import Birth, serve
 from zbridge.host.settings import HostSettings
 from zbridge.host.supervisor import Supervisor
@@ -117,7 +118,7 @@ def main() -> None:
     folder = Path(sys.argv[1])
     orders_of(folder).mkdir(exist_ok=True)
     forks = module("tests.e2e.rigs.supervised", FORKS, orders_of(folder))
-    supervisor = Supervisor((folder,), HostSettings(), forks, watch=False, verbose=False)
+    supervisor = Supervisor((folder,), HostSettings(), ForkClient(forks), watch=False, verbose=False)
     asyncio.run(until_signal(supervisor.run()))
 
 

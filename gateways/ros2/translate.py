@@ -33,7 +33,7 @@ from zbridge.protocol import (
     NotReady,
     Outcome,
     ProtocolError,
-    Robot,
+    RobotSide,
     Telemetry,
     Translate,
     Unsupported,
@@ -57,7 +57,7 @@ _LEVEL_RAD = 1e-3
 _NS_PER_MS = 1_000_000
 
 
-class RosRobot(Robot):
+class RosRobot(RobotSide):
     """One ROS 2 robot: the nodes on the other side of its router."""
 
     link_names = ("router",)

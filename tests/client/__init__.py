@@ -22,14 +22,14 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, FleetMessage, Pose, Status
 from zbridge.fleet.topics import KeySpace, Topic
 from zbridge.metrics import Metrics
-from zbridge.protocol.plugin import Outcome, Robot
+from zbridge.protocol.plugin import Outcome, RobotSide
 from zbridge.protocol.session import State
 from zbridge.robot.commands import Commands
 
 LEASE_S, DEADMAN_S = 3.0, 2.0
 
 
-class Machine(Robot):
+class Machine(RobotSide):
     """A robot that takes every command and keeps it; ``refusal`` and ``unstoppable`` say why not, ``left_out`` what."""
 
     link_names = ("robot",)

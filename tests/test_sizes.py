@@ -1,13 +1,19 @@
-"""Files and functions of the product end where their subject ends: 400 lines, and 40 of a function's body."""
+"""Files and functions of the product end where their subject ends, and tests use what is public."""
 
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 FILE_LINES, FUNCTION_LINES = 400, 40
+"""Most lines of a file, and of a function's body."""
+PRIVATE = 59
+"""Most private attributes of the product that tests touch; make it smaller where you can."""
+WHITE_BOX = ("tests/search/", "tests/simulated/", "tests/e2e/rigs/", "tests/e2e/measured/", "tests/benchmarks/")
+"""These copy and name whole states of machines, or have private attributes of their own."""
 LONGER = {
     "zbridge/control/authority.py",  # one state machine and its table
     "zbridge/robot/device.py",
@@ -37,3 +43,25 @@ def test_no_file_is_too_long() -> None:
 def test_no_function_is_too_long() -> None:
     found = {path: [*functions((ROOT / path).read_text())] for path in FILES}
     assert [(path, *each) for path, all_ in found.items() for each in all_ if each[1] > FUNCTION_LINES] == []
+
+
+def private_attributes(source: str) -> Iterator[str]:
+    """Give the private attributes that code touches of something that is not itself."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Attribute) and re.match("_[a-z]", node.attr):
+            if isinstance(node.value, ast.Name) and node.value.id in ("self", "cls", "os"):
+                continue
+            if not ast.unparse(node.value).startswith("super()"):
+                yield node.attr
+
+
+def test_tests_touch_few_private_attributes_of_the_product() -> None:
+    words = {word for path in FILES + sorted(LONGER) for word in re.findall(r"\b_[a-z]\w*", (ROOT / path).read_text())}
+    touched = [
+        (path.relative_to(ROOT).as_posix(), attribute)
+        for path in sorted((ROOT / "tests").rglob("*.py"))
+        if not path.relative_to(ROOT).as_posix().startswith(WHITE_BOX)
+        for attribute in private_attributes(path.read_text())
+        if attribute in words
+    ]
+    assert len(touched) <= PRIVATE, touched

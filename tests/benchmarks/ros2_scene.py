@@ -136,7 +136,7 @@ class Scene:
 
     def key(self, robot: str, kind: str = SCAN, name: str = "scan") -> str:
         """Give the key of a topic of a robot on ROS's side."""
-        return self.ros._names(f"/{robot}/{name}", kind)[0]
+        return self.ros.names(f"/{robot}/{name}", kind)[0]
 
     def twists(self, robot: str) -> str:
         """Give the key of a robot's cmd_vel."""

@@ -66,7 +66,7 @@ def _pictures(reads: list[bytes]) -> list[Any]:
 
 def answer_http(data: bytes) -> None:
     """Answer a request to the metrics endpoint."""
-    response = prometheus._response(data, Metrics(), lambda: ("not yet",))
+    response = prometheus.respond(data, Metrics(), lambda: ("not yet",))
     head, _, body = response.partition(b"\r\n\r\n")
     length = re.search(rb"Content-Length: ([0-9]+)", head)
     assert length is not None

@@ -196,7 +196,7 @@ class FakeBus:
     def frames(
         self, key: str, listened: Callable[[bool], None], *, best_effort: bool = False, kept: int = 0
     ) -> Publisher:
-        publisher = self._keep(_FakePublisher(key, self.network, keeps_last=bool(kept)))
+        publisher = self._keep(_FakePublisher(key, self.network, keeps_last=bool(kept), listened=listened))
         if any(meet(key_expr, key) for key_expr, _ in self.network.subscribers):
             asyncio.get_running_loop().call_soon(listened, True)
         return publisher
@@ -228,6 +228,8 @@ class FakeNetwork:
         self.queryables: list[tuple[str, Callable[[IncomingQuery], None], str]] = []
         self.tokens: list[str] = []
         self.watchers: list[tuple[str, Callable[[str, bool], None]]] = []
+        self.listened: list[tuple[str, Callable[[bool], None]]] = []
+        """The keys of those who ask whether anybody listens, and what to call when that changes."""
         self.last: dict[str, bytes] = {}
         self.history: list[Sample] = []
 
@@ -249,11 +251,15 @@ class _FakeHandle:
 
 
 class _FakePublisher(_FakeHandle):
-    def __init__(self, key: str, network: FakeNetwork, *, keeps_last: bool) -> None:
+    def __init__(
+        self, key: str, network: FakeNetwork, *, keeps_last: bool, listened: Callable[[bool], None] | None = None
+    ) -> None:
         super().__init__(self._forget)
         self.key = key
         self._network = network
         self._keeps_last = keeps_last
+        self._listened = [(key, listened)] if listened is not None else []
+        network.listened += self._listened
 
     @property
     def last(self) -> bytes | None:
@@ -270,6 +276,8 @@ class _FakePublisher(_FakeHandle):
         return True
 
     def _forget(self) -> None:
+        for entry in self._listened:
+            self._network.listened.remove(entry)
         self._network.last.pop(self.key, None)
 
 

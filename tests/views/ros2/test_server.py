@@ -118,7 +118,7 @@ class Routed(FakeBus):
 
 def test_one_router_for_both_sides_is_refused() -> None:
     planned = plan(Ros2Settings())
-    server._apart(Routed("1", "a"), Routed("2", "b"), planned)
+    server.require_two_routers(Routed("1", "a"), Routed("2", "b"), planned)
     for fleet, ros in ((Routed("1", "a"), Routed("2", "b", "a")), (Routed("1"), Routed("2", "1"))):
         with pytest.raises(ConfigError, match=r"ros = tcp/localhost:7447: the same router as the fleet's"):
-            server._apart(fleet, ros, planned)
+            server.require_two_routers(fleet, ros, planned)

@@ -5,6 +5,7 @@ import contextlib
 
 import pytest
 
+from tests.bounds import most_kept
 from tests.clock import jumping
 from tests.transport.recorder import LOCAL, Recorder, connected, heard_by, udp_socket, until
 from zbridge.metrics import Count
@@ -212,4 +213,4 @@ async def test_a_source_that_nobody_claimed_is_not_listened_to_for_a_moment_and_
         hub.receive(b"b5", ("10.0.0.1", port))
     assert len(recorder.asked) == 5003
     assert len(recorder.stray) <= 2 + udp.STRAYS_HZ
-    assert len(hub._deaf_until) <= udp.STRAY_SOURCES
+    assert most_kept(hub) <= udp.STRAY_SOURCES

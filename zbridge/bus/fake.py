@@ -133,6 +133,7 @@ class FakeBus:
         direct: bool = False,
     ) -> Handle:
         entry = (key_expr, handler)
+        self.network.lanes[key_expr] = lane
         self.network.subscribers.append(entry)
         if history or kept:
             for key, payload in tuple(self.network.last.items()):
@@ -225,6 +226,8 @@ class FakeNetwork:
 
     def __init__(self) -> None:
         self.subscribers: list[tuple[str, Callable[[Sample], None]]] = []
+        self.lanes: dict[str, Lane | Sort] = {}
+        """What the last subscriber of each key expression gave; a fake bus itself sorts nothing."""
         self.queryables: list[tuple[str, Callable[[IncomingQuery], None], str]] = []
         self.tokens: list[str] = []
         self.watchers: list[tuple[str, Callable[[str, bool], None]]] = []

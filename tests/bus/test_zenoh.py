@@ -330,4 +330,3 @@ async def test_buses_that_share_a_session_close_alone_and_serve_each_others_comm
     shares[0].attend()
     bus.publisher("fleet/r2/@cmd/stop", topics.CMD_STOP).put(b"2")
     await seen.until(lambda: len(seen) == 3)
-    assert len(bus._inboxes) == 2

@@ -219,16 +219,20 @@ async def test_a_runner_with_something_under_way_is_not_calm(
 ) -> None:
     made, _, _ = running
     assert made.process is not None
+    restarting: asyncio.Future[None] | None = None
     match what:
         case "killed":
             made.process.kill("hung")
         case "restarting":
-            made._restarting = 1
+            restarting = asyncio.ensure_future(made.restart(FILE))
+            await asyncio.sleep(0)
         case "given":
             made.process.deposit.predecessor = Deposit()
         case _:
             setattr(made.process, what, True)
     assert not made.is_idle
+    if restarting is not None:
+        restarting.cancel()
 
 
 async def test_a_resumed_runner_waits_for_its_next_process_until_the_same_time() -> None:

@@ -1,9 +1,10 @@
-"""Files and functions of the product end where their subject ends, and tests use what is public."""
+"""Files and functions end where their subject ends, a class has a name of its own, and tests use what is public."""
 
 from __future__ import annotations
 
 import ast
 import re
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,6 +13,10 @@ FILE_LINES, FUNCTION_LINES = 400, 40
 """Most lines of a file, and of a function's body."""
 PRIVATE = 30
 """Most private attributes of the product that tests touch; make it smaller where you can."""
+MIRRORED = {"ControlFeed", "Driver", "Feed", "Fleet", "Robot", "StateFeed"}
+"""The blocking form of a class of the client has its name."""
+SHARED = {"Action", "Device", "Holder", "Odometry", "Publisher", "Reading", "Session", "Standing", "State"}
+"""Names that two classes still share. ROS's message Odometry and ours are one idea; no new name belongs here."""
 WHITE_BOX = ("tests/search/", "tests/simulated/", "tests/e2e/rigs/", "tests/e2e/measured/", "tests/benchmarks/")
 """These copy and name whole states of machines, or have private attributes of their own."""
 LONGER = {
@@ -43,6 +48,12 @@ def test_no_file_is_too_long() -> None:
 def test_no_function_is_too_long() -> None:
     found = {path: [*functions((ROOT / path).read_text())] for path in FILES}
     assert [(path, *each) for path, all_ in found.items() for each in all_ if each[1] > FUNCTION_LINES] == []
+
+
+def test_a_class_has_a_name_of_its_own() -> None:
+    trees = [ast.parse((ROOT / path).read_text()) for path in FILES + sorted(LONGER)]
+    names = Counter(node.name for tree in trees for node in tree.body if isinstance(node, ast.ClassDef))
+    assert {name for name, count in names.items() if count > 1 and name[0] != "_"} <= MIRRORED | SHARED
 
 
 def private_attributes(source: str) -> Iterator[str]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from functools import lru_cache
 from typing import TypeVar
 
 import msgspec
@@ -19,11 +20,13 @@ from zbridge.metrics import Metrics
 H = TypeVar("H", bound=Handle)
 
 
+@lru_cache(maxsize=65536)
 def matches(key_expr: str, key: str) -> bool:
     """Tell whether a key expression matches a key; chunks that begin with ``@`` only match an equal chunk."""
     return _match(key_expr.split("/"), key.split("/"))
 
 
+@lru_cache(maxsize=65536)
 def meet(one: str, other: str) -> bool:
     """Tell whether there is a key that both key expressions match."""
     return _meet(one.split("/"), other.split("/"))

@@ -80,7 +80,8 @@ class Link(Protocol):
     def unacknowledged_s(self) -> float:
         """Seconds for which the oldest written byte has waited for its acknowledgement.
 
-        Exact above :data:`STALLED_S`; below, the byte may be acknowledged already. 0 where the platform does not tell.
+        Exact above :data:`STALLED_S`; below, the byte may be acknowledged already. 0 only where nothing waits, or where
+        the platform does not tell.
         """
 
     def pause(self) -> None:

@@ -29,7 +29,7 @@ class Receiver(Protocol):
         """Take a datagram from the peer."""
 
     def claims(self, datagram: bytes, port: int) -> bool:
-        """True: this datagram is from the peer. Asked for a port of the peer's host that is nobody's source yet."""
+        """Tell whether a datagram from a port of the peer's host that is nobody's source yet is from the peer."""
 
     def rivalled(self) -> None:
         """React to a second source, or a second receiver, with the same claim: the peer has no source any more."""

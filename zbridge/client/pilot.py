@@ -25,7 +25,8 @@ from zbridge.lease.stick import Stick, StickAction
 STALE_S = 0.4
 """Seconds after which a drive is not sent any more that waits for the lease."""
 MODES = 8
-"""Modes that may wait; one more is refused."""
+"""Modes that may be on their way; one more is refused."""
+_RELEASED = "the robot was released"
 
 
 class Pilot:
@@ -55,8 +56,9 @@ class Pilot:
         """While the lease is held."""
         self._waiting: tuple[Drive, float] | None = None
         """The newest drive that could not be sent, and when it came."""
-        self._modes: asyncio.Queue[tuple[str, asyncio.Future[None]]] = asyncio.Queue(MODES)
-        self._came = asyncio.Event()
+        self._granted: asyncio.Future[Driver] = self._loop.create_future()
+        self._setting = 0
+        """Modes that are not set yet."""
         self._task: asyncio.Task[None] | None = None
         self._tasks: set[asyncio.Task[None]] = set()
         """Including those that release their lease."""
@@ -86,15 +88,27 @@ class Pilot:
 
     async def set_mode(self, mode: str) -> None:
         """Set who moves the robot, and keep the lease until the mode is none; raise Refused or BusError."""
-        done: asyncio.Future[None] = self._loop.create_future()
-        try:
-            self._modes.put_nowait((mode, done))
-        except asyncio.QueueFull:
-            raise TooFast("too many changes of the mode at the same time") from None
+        if self._setting >= MODES:
+            raise TooFast("too many changes of the mode at the same time")
+        self._setting += 1
         self.stick.in_use = True
         self.take()
-        self._came.set()
-        await done
+        try:
+            driver = await asyncio.shield(self._granted)
+            try:
+                await driver.mode(mode)
+            except Exception as error:
+                if self._driver is driver:
+                    self._outlasts(error)
+                raise _known(error) from error
+            if self._driver is not driver:
+                raise LeaseLost(_RELEASED)
+            self.mode = mode
+        finally:
+            self._setting -= 1
+            self.stick.in_use = self.mode != "none" or self._setting > 0
+            self._arm()
+        self._send_waiting()
 
     def hold_back(self, why: str) -> None:
         """Withdraw what waits; the stick must be centred once, for it was deflected before this."""
@@ -114,54 +128,27 @@ class Pilot:
     # The lease
 
     def _begin(self) -> None:
+        self._granted = self._loop.create_future()
         self._task = task = self._loop.create_task(self._hold())
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
     async def _hold(self) -> None:
-        """Hold the lease until it is lost or cancelled."""
+        """Hold the lease until it ends."""
         me = asyncio.current_task()
         try:
             async with self._turn, self._control() as driver:
                 self._driver = driver
                 self.stick.granted()
+                self._granted.set_result(driver)
+                self._send_waiting()
                 self._arm()
-                await self._serve(driver)
+                if self._driver is driver:
+                    await driver.lost.wait()
+                    raise driver.loss or LeaseLost("the lease is lost")
         except Exception as error:
             if self._task is me:
                 self._end(error)
-
-    async def _serve(self, driver: Driver) -> None:
-        """Carry out what waits, until the lease ends; raise its loss."""
-        lost = self._loop.create_task(driver.lost.wait())
-        lost.add_done_callback(lambda _: self._came.set())
-        self._came.set()
-        try:
-            while driver.loss is None and self._driver is driver:
-                await self._came.wait()
-                self._came.clear()
-                while not self._modes.empty():
-                    await self._set_mode(driver)
-                if self._waiting is not None:
-                    self._send(*self._waiting)
-        finally:
-            lost.cancel()
-        if driver.loss is not None:
-            raise driver.loss
-
-    async def _set_mode(self, driver: Driver) -> None:
-        mode, done = self._modes.get_nowait()
-        try:
-            await driver.mode(mode)
-        except BaseException as error:
-            if not done.done():
-                done.set_exception(error if isinstance(error, ZbridgeError) else BusError("the viewer is gone"))
-            raise
-        self.mode = mode
-        self.stick.in_use = mode != "none" or not self._modes.empty()
-        self._arm()
-        if not done.done():
-            done.set_result(None)
 
     def _end(self, error: Exception | None) -> None:
         """Note that there is no lease any more, and why."""
@@ -170,19 +157,21 @@ class Pilot:
             task.cancel()
         self._driver = self._waiting = None
         self.stick.in_use = False
-        failure = error if isinstance(error, ZbridgeError | None) else BusError(describe(error))
+        failure = None if error is None else _known(error)
         if failure is None:
             self.stick.released()
         else:
             self.stick.lost(str(failure))
-        while not self._modes.empty():
-            _, done = self._modes.get_nowait()
-            if not done.done():
-                done.set_exception(failure or LeaseLost("the robot was released"))
+        if self._setting and not self._granted.done():
+            self._granted.set_exception(failure or LeaseLost(_RELEASED))
         self._on_end(failure)
         self.mode = "none"
 
     # What is sent
+
+    def _send_waiting(self) -> None:
+        if self._waiting is not None and self._driver is not None:
+            self._send(*self._waiting)
 
     def _send(self, drive: Drive, came_at: float) -> None:
         """Send a drive, or let it wait; raise Refused if the lease outlasts that."""
@@ -192,15 +181,20 @@ class Pilot:
         if stale or (drive.moving and self.stick.needs_neutral is not None):
             return
         try:
-            if not self._driver.now(drive):
+            if self._setting or not self._driver.now(drive):
                 self._waiting = (drive, came_at)
         except Exception as error:
-            if isinstance(error, LeaseLost) or not isinstance(error, Refused) or not self.stick.rules.keeps:
-                self._end(error)
-                return
-            if isinstance(error, NeutralFirst):
-                self.stick.refused("motion was refused")
-            raise
+            if self._outlasts(error):
+                raise
+
+    def _outlasts(self, error: Exception) -> bool:
+        """End the lease, unless it outlasts what became of a command; return whether it does."""
+        if isinstance(error, LeaseLost) or not isinstance(error, Refused) or not self.stick.rules.keeps:
+            self._end(error)
+            return False
+        if isinstance(error, NeutralFirst):
+            self.hold_back("motion was refused")
+        return True
 
     # Time
 
@@ -221,3 +215,7 @@ class Pilot:
         self._timer = None
         self._expire(self._loop.time())
         self._arm()
+
+
+def _known(error: Exception) -> ZbridgeError:
+    return error if isinstance(error, ZbridgeError) else BusError(describe(error))

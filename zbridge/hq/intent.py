@@ -73,7 +73,7 @@ class Intent(Stick):
             self.refused(_MODE_NONE)
             self._modeless_at = now
             raise LeaseLost(_MODE_NONE, Code.NO_LEASE)
-        return super().motion(now, lasts=lasts)
+        return self._on_motion(now, lasts)
 
     def neutral(self, now: float, *, whole: bool = True) -> StickAction:
         """Take neutral. whole=False: of one part while the program still moves another, so that no motion has ended.
@@ -89,7 +89,7 @@ class Intent(Stick):
             self._moving = False
             self._rests_at = min(self._rests_at, now + RESTS_S)
             return self._handle(StickInput.HARMLESS)
-        return super().neutral(now)
+        return self._on_neutral(now)
 
     def choose(self, mode: str, now: float) -> StickAction:
         """Take a control mode; ``autonomous`` counts as motion, ``none`` releases the robot."""

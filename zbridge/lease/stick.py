@@ -128,19 +128,12 @@ class Stick:
     def motion(self, now: float, *, lasts: bool = True) -> StickAction:
         """Take motion; raise NeutralFirst if neutral is needed. lasts: whether the user repeats this motion."""
         self.expire(now)
-        action = self._handle(_MOTION)
-        self._used_at = now
-        if lasts:
-            self._moved_at, self._moving = now, True
-        return action
+        return self._on_motion(now, lasts)
 
     def neutral(self, now: float) -> StickAction:
         """Take zero motion: nothing moves any more, and no neutral is needed."""
         self.expire(now)
-        self._moving, self.needs_neutral = False, None
-        if self.rules.neutral_counts:
-            self._used_at = now
-        return self._handle(_NEUTRAL)
+        return self._on_neutral(now)
 
     def want(self, now: float) -> StickAction:
         """Get the lease without motion."""
@@ -190,6 +183,21 @@ class Stick:
     def wants_release(self, now: float) -> bool:
         """Return whether the lease is held, but was unused for so long that it must be released."""
         return self.held and not self.in_use and now >= self._last_used() + self.idle_s
+
+    # The machine
+
+    def _on_motion(self, now: float, lasts: bool) -> StickAction:
+        action = self._handle(_MOTION)
+        self._used_at = now
+        if lasts:
+            self._moved_at, self._moving = now, True
+        return action
+
+    def _on_neutral(self, now: float) -> StickAction:
+        self._moving, self.needs_neutral = False, None
+        if self.rules.neutral_counts:
+            self._used_at = now
+        return self._handle(_NEUTRAL)
 
     def _last_used(self) -> float:
         return self._used_at

@@ -22,14 +22,19 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, FleetMessage, Pose, Status
 from zbridge.fleet.topics import KeySpace, Topic
 from zbridge.metrics import Metrics
-from zbridge.protocol.plugin import Outcome, Robot
+from zbridge.protocol.plugin import Outcome, RobotSide
 from zbridge.protocol.session import State
 from zbridge.robot.commands import Commands
 
 LEASE_S, DEADMAN_S = 3.0, 2.0
 
 
-class Machine(Robot):
+def raw_ms() -> float:
+    """Return the time of the loop: a busy machine must not make commands older than the loop knows."""
+    return asyncio.get_running_loop().time() * 1000
+
+
+class Machine(RobotSide):
     """A robot that takes every command and keeps it; ``refusal`` and ``unstoppable`` say why not, ``left_out`` what."""
 
     link_names = ("robot",)
@@ -90,6 +95,7 @@ class Gateway:
             pump=lambda: None,
             clock=self._loop.time,
             clock_ns=time.time_ns,
+            raw_ms=raw_ms,
         )
         standstill = Standstill(context, self.authority, idle_stop_s=0.0)
         self.enforcer = Enforcer(context, self.authority, standstill, Audit(name, lambda line: None))
@@ -149,9 +155,9 @@ class World:
         self.gateways = {name: Gateway(self.bus, name) for name in names or ("r1",)}
         self.gateway = next(iter(self.gateways.values()))
         self.machine = self.gateway.machine
-        self.fleet = Fleet(self.bus.join("mine"))
+        self.fleet = Fleet(self.bus.join("mine"), clock_ms=raw_ms)
         self.robot = self.fleet[self.gateway.name]
-        self.others = Fleet(self.bus.join("others"))[self.gateway.name]
+        self.others = Fleet(self.bus.join("others"), clock_ms=raw_ms)[self.gateway.name]
         for gateway in self.gateways.values():
             if served:
                 gateway.serve()
@@ -174,7 +180,7 @@ async def settle() -> None:
 
 def subscriptions(bus: FakeBus, key: str) -> int:
     """Count the subscriptions of this very key."""
-    return sum(key_expr == key for key_expr, _ in bus._shared.subscribers)
+    return sum(key_expr == key for key_expr, _ in bus.network.subscribers)
 
 
 def tokens(bus: FakeBus, name: str = "r1") -> list[str]:
@@ -185,4 +191,4 @@ def tokens(bus: FakeBus, name: str = "r1") -> list[str]:
 def numbered_tokens(bus: FakeBus, name: str = "r1") -> list[str]:
     """List the liveliness tokens of programs that drive."""
     prefix = f"fleet/{name}/@alive/"
-    return [token.removeprefix(prefix) for token in bus._shared.tokens if token.startswith(prefix + "operator.")]
+    return [token.removeprefix(prefix) for token in bus.network.tokens if token.startswith(prefix + "operator.")]

@@ -48,7 +48,7 @@ def say(stick: Stick, now: float, rest: str, step: str) -> None:
         assert f"time -> {done}" == rest, step
         return
     stick.heard(now)
-    said, expected = rest.split(" -> ") if " -> " in rest else (rest.split(" ! ")[0], "")
+    said, expected = rest.split(" -> ") if " -> " in rest else (rest.split(" ! ", maxsplit=1)[0], "")
     if expected:
         assert getattr(stick, said)(now).value == expected, step
     else:

@@ -116,7 +116,7 @@ async def test_a_second_gateway_waits_until_the_first_goes_and_says_so_once(capl
 
 @pytest.mark.parametrize("zids", [("1", "2"), ("b", "a")])
 async def test_of_two_that_start_at_the_same_moment_the_lower_id_goes_on(zids: tuple[str, str]) -> None:
-    shared = FakeBus()._shared
+    shared = FakeBus().network
     claims = {zid: Ownership(Distant(zid, shared), KEYS) for zid in zids}
     takes = {zid: asyncio.create_task(claim.take()) for zid, claim in claims.items()}
     await asyncio.sleep(5.0)
@@ -130,7 +130,7 @@ async def test_of_two_that_start_at_the_same_moment_the_lower_id_goes_on(zids: t
 async def test_of_those_that_start_together_one_goes_on(count: int) -> None:
     settled = []
     for seed in range(20):
-        rng, shared = random.Random(seed), FakeBus()._shared
+        rng, shared = random.Random(seed), FakeBus().network
         takes = []
         for number in range(count):
             bus = Distant(str(number), shared)
@@ -145,7 +145,7 @@ async def test_of_those_that_start_together_one_goes_on(count: int) -> None:
 async def test_one_that_holds_the_robot_is_not_driven_out_by_a_lower_id_that_does_not_see_its_token() -> None:
     bus = FakeBus("9")
     await owned(bus)
-    bus._shared.tokens.remove(TOKEN)
+    bus.network.tokens.remove(TOKEN)
     await kept_waiting(bus.join("1"))
 
 
@@ -155,18 +155,17 @@ class Robot:
 
     healthy: bool = True
     connected_at: float | None = 0.0
-    latches: tuple[Latch, ...] = ()
+    record: LatchRecord = field(default_factory=LatchRecord)
     rivals: list[set[str]] = field(default_factory=list)
     heard_latches: set[Latch] = field(default_factory=set)
     merged: list[LatchRecord] = field(default_factory=list)
-    autonomous: bool = False
     turns: list[str] = field(default_factory=list)
 
     @property
     def standing(self) -> Standing:
         now = asyncio.get_running_loop().time()
         age_s = now - self.connected_at if self.must_stay else 0.0
-        return Standing(self.healthy, age_s, self.latches, self.autonomous)
+        return Standing(self.healthy, age_s, self.record)
 
     @property
     def must_stay(self) -> bool:
@@ -279,7 +278,7 @@ async def test_a_gateway_that_does_not_answer_at_once_is_waited_for() -> None:
 
     bus = FakeBus("1")
     await owned(bus)
-    await kept_waiting(Silent("0", bus._shared))
+    await kept_waiting(Silent("0", bus.network))
 
 
 # Two that serve one robot
@@ -309,9 +308,9 @@ class Two:
     def heal(self, *, noticed: bool) -> None:
         """Join the two networks; noticed: both sessions have lost their bus, and find it again now."""
         one, other = self.buses
-        one._shared.queryables += other._shared.queryables
-        one._shared.tokens += other._shared.tokens
-        other._shared = one._shared
+        one.network.queryables += other.network.queryables
+        one.network.tokens += other.network.tokens
+        other.network = one.network
         if noticed:
             for up in (False, True):
                 for bus in self.buses:
@@ -362,7 +361,7 @@ async def test_of_two_that_meet_exactly_one_serves_within_2_s(
         assert two.robots[winner].rivals[-1] == {two.buses[loser].zid}
     else:
         assert (two.robots[loser].turns, two.watching[loser].done()) == ([], True)
-    assert two.buses[0]._shared.tokens == [TOKEN]
+    assert two.buses[0].network.tokens == [TOKEN]
 
 
 @pytest.mark.parametrize("seed", range(50))
@@ -476,7 +475,7 @@ async def test_whoever_answers_better_claims_silences_a_gateway_for_as_long_as_i
     assert (robot.turns, await bus.alive(TOKEN), watching.done()) == (["aside", "in"], [TOKEN], False)
 
 
-async def test_a_waiting_gateway_hears_of_the_latched_stops_of_the_one_that_serves() -> None:
+async def test_a_waiting_gateway_hears_of_the_latches_and_releases_of_the_one_that_serves() -> None:
     bus, mirrored = FakeBus("5"), list[LatchRecord]()
     latch = Latch(b"a" * 16, "ann", "a cable is loose", fleet=True)
     first = await owned(bus)
@@ -484,9 +483,9 @@ async def test_a_waiting_gateway_hears_of_the_latched_stops_of_the_one_that_serv
     taking = asyncio.create_task(Ownership(bus.join("1"), KEYS, mirror=mirrored.append).take())
     await asyncio.sleep(1.0)
     assert {*mirrored} == {LatchRecord()}
-    robot.latches, robot.autonomous = (latch,), True
+    robot.record = LatchRecord((latch,), (b"b" * 16,), (b"c" * 16,), autonomous=True)
     await asyncio.sleep(1.0)
-    assert mirrored[-1] == LatchRecord((latch,), autonomous=True)
+    assert mirrored[-1] == robot.record
     assert not taking.done()
 
 
@@ -552,9 +551,9 @@ def test_the_table_of_the_documentation_is_the_one_that_is_executed() -> None:
 async def test_a_latched_stop_of_the_one_that_leaves_is_heard_by_the_one_that_stays(*, noticed: bool) -> None:
     latch = Latch(b"\x07" * 16, "ann")
     for first, second, winner in [
-        (Robot(True, 0.0), Robot(False, None, (latch,)), 0),
-        (Robot(False, None, (latch,)), Robot(True, 0.0), 1),
-        (Robot(True, 0.0), Robot(True, 5.0, (latch,)), 0),
+        (Robot(True, 0.0), Robot(False, None, LatchRecord((latch,))), 0),
+        (Robot(False, None, LatchRecord((latch,))), Robot(True, 0.0), 1),
+        (Robot(True, 0.0), Robot(True, 5.0, LatchRecord((latch,))), 0),
     ]:
         two = Two()
         await two.serve(first, second)

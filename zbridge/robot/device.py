@@ -31,7 +31,7 @@ from zbridge.lease.lease_holder import raw_ms
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import DeviceAddress
 from zbridge.protocol.kept import Budget, Exported
-from zbridge.protocol.plugin import Robot
+from zbridge.protocol.plugin import RobotSide
 from zbridge.protocol.session import Datagram, Session, State
 from zbridge.protocol.session_kept import PARTIAL
 from zbridge.protocol.session_table import SessionTable
@@ -72,7 +72,7 @@ class Device:
 
     def __init__(
         self,
-        robot: Robot,
+        robot: RobotSide,
         addresses: tuple[DeviceAddress, ...],
         *,
         protocol: str,
@@ -296,12 +296,12 @@ class Device:
     def standing(self) -> Standing:
         """How this gateway stands with the robot."""
         session, talk = self._context.robot.driving, self._links.first.conversation
-        latches = self._enforcer.authority.latches
+        record = self._enforcer.authority.latches.record
         if talk is None or session is None:
-            return Standing(latches=latches.in_force, autonomous=latches.autonomous)
+            return Standing(record=record)
         established = session.state is State.ESTABLISHED and session.doubtful is None
         healthy = established and not talk.stalled and talk.unheard_s <= HEARD_S
-        return Standing(healthy, talk.connected_s, latches.in_force, latches.autonomous)
+        return Standing(healthy, talk.connected_s, record)
 
     @property
     def must_stay(self) -> bool:

@@ -112,7 +112,7 @@ class WireLink:
                 self._report(f"{self.link}: the recording is not whole: {reader.fault}")
 
     @contextlib.asynccontextmanager
-    async def _conversation(self) -> AsyncIterator[_Conversation]:
+    async def _conversation(self) -> AsyncIterator[_Playback]:
         """Wait for the gateway's connection, and hold it."""
         reader, writer = await self._connections.get()
         self._talking, self._received, self._source = True, 0, None
@@ -120,7 +120,7 @@ class WireLink:
         self._report(f"{self.link}: the gateway connected from {self._peer}")
         listening = asyncio.ensure_future(self._listen(reader))
         try:
-            yield _Conversation(self, writer, asyncio.get_running_loop().time(), self._speed)
+            yield _Playback(self, writer, asyncio.get_running_loop().time(), self._speed)
         finally:
             self._talking = False
             listening.cancel()
@@ -155,7 +155,7 @@ class WireLink:
             self._datagrams.sendto(data, self._source or writer.get_extra_info("peername")[:2])
 
 
-class _Conversation:
+class _Playback:
     """One connection of the gateway."""
 
     def __init__(self, link: WireLink, writer: asyncio.StreamWriter, began: float, speed: float) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 
@@ -20,19 +22,24 @@ class Scene:
     """One robot, and a session that drives it."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(drive, "_raw_keys", lambda *_: contextlib.nullcontext())
+        monkeypatch.setattr(drive, "_raw_keys", self.raw_keys)
         self.world = World()
         self.session = Session(self.world.robot, 0.5, who="ann", takeover=False)
         self.running = asyncio.ensure_future(self.session.run())
 
+    def raw_keys(self, loop: asyncio.AbstractEventLoop, take: Callable[[str], None]) -> Any:
+        """Stand in for the terminal."""
+        self.type = take
+        return contextlib.nullcontext()
+
     async def hold(self, key: str, seconds: float = 0.3) -> None:
         """Hold a key for so long, as terminals report it."""
         for _ in range(round(seconds / 0.1)):
-            self.session._take(key)
+            self.type(key)
             await asyncio.sleep(0.1)
 
     async def press(self, key: str) -> None:
-        self.session._take(key)
+        self.type(key)
         await asyncio.sleep(0.3)
 
     @property
@@ -76,7 +83,7 @@ async def test_after_a_stop_the_lease_is_taken_again_with_enter_and_a_held_key_m
     scene.world.machine.commands.clear()
     await scene.hold("w", 1.0)
     assert (scene.holder, scene.moved) == (None, 0)
-    scene.session._take("\r")
+    scene.type("\r")
     await scene.hold("w", 1.0)
     assert scene.holder == "ann"
     scene.world.machine.commands.clear()

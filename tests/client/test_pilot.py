@@ -30,8 +30,10 @@ class Scene:
         self.pilot = self.make(BY_MOTION)
 
     def make(self, rules: StickRules, who: str = "ann") -> Pilot:
-        def control():
-            return self.world.robot.control(who, deadman_s=0.5, wait_s=2.0)
+        @contextlib.asynccontextmanager
+        async def control():
+            async with self.world.robot.control(who, deadman_s=0.5, wait_s=2.0) as self.driver:
+                yield self.driver
 
         self.pilot = Pilot(Stick(rules), control, on_end=self.ended.append, turn=self.turn)
         return self.pilot
@@ -220,7 +222,7 @@ async def test_a_bus_that_breaks_under_a_command_ends_the_lease(scene: Scene, mo
     def broken(_: Drive) -> bool:
         raise OSError("no bus")
 
-    monkeypatch.setattr(scene.pilot._driver, "now", broken)
+    monkeypatch.setattr(scene.driver, "now", broken)
     scene.pilot.drive(SECOND)
     await asyncio.sleep(0.5)
     assert len(scene.ended) == 1

@@ -7,7 +7,7 @@ import pytest
 from tests.bounds import most_kept
 from zbridge.errors import Refused
 from zbridge.lease.stick import StickAction
-from zbridge.views.ros2.driving import PUBLISHERS, REMEMBERED, Driving, Publisher
+from zbridge.views.ros2.driving import PUBLISHERS, REMEMBERED, Driving, TwistPublisher
 
 A, B = b"a" * 16, b"b" * 16
 
@@ -136,7 +136,7 @@ def happen(driving: Driving, what: str, now: float) -> str:
     return ""
 
 
-def released(publisher: Publisher, why: str) -> str:
+def released(publisher: TwistPublisher, why: str) -> str:
     publisher.stick.released()
     return f"release {why}"
 

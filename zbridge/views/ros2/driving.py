@@ -34,7 +34,7 @@ RULES = StickRules(
 _EARLY = "it was there before"
 
 
-class Publisher(msgspec.Struct, frozen=True, eq=False):
+class TwistPublisher(msgspec.Struct, frozen=True, eq=False):
     """What is known of one publisher. name: of its node, ``/teleop``."""
 
     name: str
@@ -46,8 +46,8 @@ class Driving:
 
     def __init__(self, robot: str) -> None:
         self._robot = robot
-        self.publishers: dict[bytes, Publisher] = {}
-        self._driver: Publisher | None = None
+        self.publishers: dict[bytes, TwistPublisher] = {}
+        self._driver: TwistPublisher | None = None
         """The last one that might drive."""
         self._gone: OrderedDict[bytes, None] = OrderedDict()
 
@@ -55,7 +55,7 @@ class Driving:
         return f"<Driving {self._robot} {list(self.publishers.values())}>"
 
     @property
-    def driver(self) -> Publisher | None:
+    def driver(self) -> TwistPublisher | None:
         """The publisher that drives."""
         return self._driver if self._driver is not None and self._driver.stick.active else None
 
@@ -72,7 +72,7 @@ class Driving:
         self._gone.pop(gid, None)
         stick = Stick(RULES, why)
         stick.heard_at = now  # it may have spoken until now: its silence begins here
-        self.publishers[gid] = Publisher(name, stick)
+        self.publishers[gid] = TwistPublisher(name, stick)
         return True
 
     def gone(self, gid: bytes) -> None:

@@ -26,8 +26,7 @@ from zbridge.app.runtime import RUNTIME, Runtime, open_audit
 from zbridge.app.serving import SERVED_ELSEWHERE, Begin, Serving
 from zbridge.app.tasks import together, until
 from zbridge.bus import Bus, Handle, IncomingQuery
-from zbridge.bus.tls.files import own_certificate
-from zbridge.bus.tls.member import own_name
+from zbridge.bus.tls.files import own_certificate, own_name
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
 from zbridge.control.context import Conditions

@@ -24,8 +24,8 @@ from zbridge.robot import ownership
 from zbridge.ros2 import Attachment, read_attachment, types_of
 from zbridge.ros2.rmw_zenoh import read_token
 from zbridge.views.foxglove import requests
-from zbridge.views.foxglove.twist import Scale
-from zbridge.views.foxglove.twist import read_twist as read_json_twist
+from zbridge.views.foxglove.requests import Scale
+from zbridge.views.foxglove.requests import read_twist as read_json_twist
 from zbridge.views.ros2.cmd_vel import STAMPED, TWIST
 from zbridge.views.ros2.cmd_vel import read_twist as read_cdr_twist
 from zbridge.views.ros2.settings import RobotBody
@@ -180,8 +180,7 @@ def targets() -> Iterator[Target]:
                                            "zbridge/protocol/address.py"), 512)  # fmt: skip
     yield Target("keyed-sample", read_keyed, _samples, ("zbridge/protocol/samples.py", "zbridge/ros2/rmw_zenoh.py"))
     yield Target("cdr", read_cdr, _cdr, ("zbridge/ros2/types.py", "zbridge/views/ros2/cmd_vel.py"))
-    yield Target("viewer", read_viewer, _viewer, ("zbridge/views/foxglove/requests.py",
-                                                  "zbridge/views/foxglove/twist.py"))  # fmt: skip
+    yield Target("viewer", read_viewer, _viewer, ("zbridge/views/foxglove/requests.py",))
 
 
 def _fleet() -> Iterator[bytes]:

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.hq.scripts import scripts
-from tests.tables import documented, executed
 from zbridge.errors import Refused
-from zbridge.hq.intent import LEASE_S, TOGETHER_S, Action, Intent
+from zbridge.hq.intent import LEASE_S, TOGETHER_S, Intent
+from zbridge.lease.stick import StickAction
 
 DEADMAN_S = 1.25
 
@@ -24,7 +24,7 @@ BEGINNINGS = {
     "on its own": "0 mode none -> nothing; 0 neutral -> nothing; 0 mode autonomous -> acquire; granted 3",
 }
 """What a program has said at second 0; whoever chooses must choose a control mode before it drives."""
-SAID: dict[str, Callable[[Intent, float], Action]] = {
+SAID: dict[str, Callable[[Intent, float], StickAction]] = {
     "motion": lambda intent, now: intent.motion(now),
     "neutral": lambda intent, now: intent.neutral(now),
     "neutral of a part": lambda intent, now: intent.neutral(now, whole=False),
@@ -40,9 +40,9 @@ HAPPENED: dict[str, Callable[[Intent, str], object]] = {
 }
 SHOWN: dict[str, Callable[[Intent, str], object]] = {
     "held": lambda intent, _: intent.held,
-    "asking": lambda intent, _: intent.asking,
+    "asking": lambda intent, _: intent.active and not intent.held,
     "may steer": lambda intent, _: intent.may_steer,
-    "owes neutral": lambda intent, _: intent.held_back is not None,
+    "needs neutral": lambda intent, _: intent.needs_neutral is not None,
     "wants release": lambda intent, now: intent.wants_release(float(now)),
 }
 
@@ -96,7 +96,7 @@ neutral after motion by the stick stops a robot that drives itself [on its own]
 a neutral that is owed is sent in mode 3 too [on its own]
     refused robot lost; 1.0 neutral -> send; 1.5 neutral -> nothing
 a robot on its own has no deadman and is used as long as anything is heard [on its own]
-    expire 1000; not owes neutral; heard 1000; not wants release 1002.6; is wants release 1002.8
+    expire 1000; not needs neutral; heard 1000; not wants release 1002.6; is wants release 1002.8
 a robot taken back from driving itself is not given away at once [on its own]
     heard 9.5; 10 mode manual -> send; not wants release 12.6; is wants release 12.8
 # Deadman
@@ -106,29 +106,29 @@ motion that is not repeated within the deadman has ended, noticed by itself or b
 silence after neutral is no deadman [driving]
     0.1 neutral -> send; 2.9 motion -> send
 the deadman counts from the motion and not from the grant [ready]
-    0 motion -> acquire; granted 3; expire 1.25; is owes neutral
+    0 motion -> acquire; granted 3; expire 1.25; is needs neutral
 neutral of one part, or a mode, does not put the deadman of the others off [driving]
-    0.1 neutral of a part -> send; 1 mode autonomous -> send; 1.1 mode manual -> send; expire 1.25; is owes neutral
+    0.1 neutral of a part -> send; 1 mode autonomous -> send; 1.1 mode manual -> send; expire 1.25; is needs neutral
 # What may have waited in the network
 a push right behind the neutral that ends a silence moves nothing, however often both come [driving]
     heard 0.1; 0.1 motion -> send; expire 1.4; heard 2.4; 2.4 neutral -> send; 2.4 motion ! deadman: release the stick
-    2.45 neutral -> send; 2.5 motion ! deadman; heard 2.7; 2.7 motion ! deadman; is owes neutral
+    2.45 neutral -> send; 2.5 motion ! deadman; heard 2.7; 2.7 motion ! deadman; is needs neutral
 a neutral after a silence counts once three tenths of a second pass without motion [driving]
     heard 0.1; 0.1 motion -> send; expire 1.4; heard 2.4; 2.4 neutral -> send; heard 2.6; 2.6 neutral -> send
-    is owes neutral; heard 2.71; 2.71 neutral -> send; not owes neutral; 2.72 motion -> send
+    is needs neutral; heard 2.71; 2.71 neutral -> send; not needs neutral; 2.72 motion -> send
 it counts without another one, too [driving]
-    heard 0.1; 0.1 motion -> send; expire 1.4; heard 2.4; 2.4 neutral -> send; expire 2.69; is owes neutral; expire 2.71
-    not owes neutral; heard 2.8; 2.8 motion -> send
+    heard 0.1; 0.1 motion -> send; expire 1.4; heard 2.4; 2.4 neutral -> send; expire 2.69; is needs neutral
+    expire 2.71; not needs neutral; heard 2.8; 2.8 motion -> send
 mode autonomous behind it is motion [choosing]
     heard 0.1; 0.1 mode autonomous -> acquire; granted 3; lost stop; heard 2.0; 2.0 neutral -> nothing
     2.1 mode autonomous ! stop: release the stick first; 2.4 mode autonomous ! stop; 2.5 neutral -> nothing
     2.81 mode autonomous -> acquire
 a neutral still ends motion at once, and one without a silence before it counts at once [driving]
     heard 0.1; 0.1 motion -> send; heard 1.3; 1.3 motion -> send; heard 2.6; 2.6 neutral -> send; 2.61 motion ! deadman
-    heard 2.7; 2.7 neutral -> send; heard 3.1; 3.1 neutral -> send; not owes neutral; refused busy; 3.2 neutral -> send
-    not owes neutral; 3.21 motion -> send
+    heard 2.7; 2.7 neutral -> send; heard 3.1; 3.1 neutral -> send; not needs neutral; refused busy; 3.2 neutral -> send
+    not needs neutral; 3.21 motion -> send
 a neutral that was said before a stop does not count after it [driving]
-    heard 0.1; 0.1 motion -> send; heard 2.0; 2.0 neutral -> send; lost stop; expire 2.4; is owes neutral
+    heard 0.1; 0.1 motion -> send; heard 2.0; 2.0 neutral -> send; lost stop; expire 2.4; is needs neutral
     2.4 motion ! stop
 a new program was not silent
     heard 0; 0 neutral -> nothing; 0.1 motion -> acquire
@@ -137,7 +137,7 @@ a stick that was pushed while the mode was none moves nothing when the mode is c
     0.5 motion ! control mode is none; not asking; 0.61 mode manual -> nothing
     0.7 motion ! control mode is none: release the stick first; 0.8 neutral -> nothing; 0.9 motion -> acquire
 a mode that motion has overtaken is no mode that came too late [choosing]
-    1 motion ! control mode is none; 1.05 mode manual -> nothing; not owes neutral; 1.5 motion -> acquire
+    1 motion ! control mode is none; 1.05 mode manual -> nothing; not needs neutral; 1.5 motion -> acquire
 a mode after motion that came twice is one that came too late [choosing]
     1 motion ! control mode is none; 1.5 motion ! control mode is none; 1.55 mode manual -> nothing
     2 motion ! control mode is none: release the stick
@@ -147,7 +147,7 @@ a mode stands through release, loss and neutral, and alone moves nothing [choosi
 mode none gives the robot back, had or only asked for, and ends motion [choosing]
     0.0 mode manual -> nothing; 0.1 motion -> acquire; 0.2 mode none -> release; released; 0.3 mode manual -> nothing
     0.4 motion -> acquire; granted 3; 0.5 mode none -> release; released; 0.6 mode none -> nothing; expire 9
-    not owes neutral
+    not needs neutral
 a mode while the robot is held is sent and while it is asked for waits [choosing]
     0 mode manual -> nothing; 0.1 motion -> acquire; 0.2 mode autonomous -> wait; 0.3 mode manual -> wait; granted 3
     0.4 mode autonomous -> send; 0.5 mode manual -> send
@@ -172,7 +172,7 @@ def test_motion_lives_and_keeps_the_robot_as_long_as_no_gap_reaches_the_deadman(
     intent, now = played(BEGINNINGS["driving for 2 s"]), 0.0
     for gap in gaps:
         now += gap
-        assert intent.motion(now) is Action.SEND
+        assert intent.motion(now) is StickAction.SEND
         assert not intent.wants_release(now)
     with pytest.raises(Refused, match="deadman"):
         intent.motion(now + end)
@@ -187,9 +187,9 @@ def test_whatever_is_said_in_any_order_nothing_moves_that_owes_neutral(steps: li
     for wait, step in steps:
         now += wait
         owes = owes or now >= moving_until
-        if step == "grant" and intent.asking:
+        if step == "grant" and intent.active and not intent.held:
             intent.granted(LEASE_S)
-        elif step == "lose" and (intent.asking or intent.held):
+        elif step == "lose" and intent.active:
             intent.lost("stop")
             owes, overtaken = True, -math.inf
         elif step == "refuse":
@@ -210,10 +210,5 @@ def test_whatever_is_said_in_any_order_nothing_moves_that_owes_neutral(steps: li
             owes, overtaken = (False, -math.inf) if step == "neutral" else (owes, overtaken)
             moving_until = now + DEADMAN_S if step == "motion" else moving_until
             moving_until = math.inf if owes or step in ("neutral", "mode none") else moving_until
-            if done is Action.RELEASE:
+            if done is StickAction.RELEASE:
                 intent.released()
-        assert not (intent.held and intent.asking)
-
-
-def test_the_table_of_the_documentation_is_the_one_that_is_executed() -> None:
-    assert documented("control.md", "the program, or its lease") == executed(Intent.TABLE)

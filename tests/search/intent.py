@@ -15,11 +15,12 @@ from unittest.mock import patch
 
 from tests.search.search import Finding, _Row
 from zbridge.errors import Refused
-from zbridge.hq.intent import Action, Intent
+from zbridge.hq.intent import Intent
+from zbridge.lease.stick import StickAction
 
 DEADMAN_S, STEP_S = 0.5, 0.25
 MODES = ("none", "manual", "autonomous")
-_TIMES = ("_moved_at", "_heard_at", "_rests_at", "_modeless_at")
+_TIMES = ("_moved_at", "heard_at", "_rests_at", "_modeless_at")
 _FAR = 3
 """Steps after which a time in the past is as any other."""
 
@@ -48,7 +49,6 @@ def search_intent() -> FoundIntent:
     table = {state: _Row("Intent", state.value, row, found.cells) for state, row in Intent.TABLE.items()}
     with patch.object(Intent, "TABLE", table):
         first = Intent(DEADMAN_S)
-        first.lease_s = 1.0
         seen = {_key(first, 1000.0, Known())}
         level = [(first, 1000.0, Known())]
         while level:
@@ -67,7 +67,7 @@ def search_intent() -> FoundIntent:
 
 def _key(intent: Intent, now: float, known: Known) -> Any:
     times = tuple(_steps(getattr(intent, name) - now) for name in _TIMES)
-    return (intent._state, intent.mode, intent.held_back or "", intent._moving, intent._waited, times, known)
+    return (intent._state, intent.mode, intent.needs_neutral or "", intent._moving, intent._waited, times, known)
 
 
 def _steps(seconds: float) -> int:
@@ -84,7 +84,7 @@ def _after(intent: Intent, now: float, known: Known) -> Iterator[tuple[Intent, f
     for name, act in _MOVES.items():
         after = _copy(intent)
         later = now + STEP_S if name == "time" else now
-        action: Action | None = None
+        action: StickAction | None = None
         with contextlib.suppress(Refused):
             action = act(after, later)
         yield after, later, _judge(name, intent, after, action, known)
@@ -100,43 +100,44 @@ def _after(intent: Intent, now: float, known: Known) -> Iterator[tuple[Intent, f
         yield after, now, Known(lease, owes, known.moving and name == "granted")
 
 
-def _judge(name: str, before: Intent, after: Intent, action: Action | None, known: Known) -> Known:
+def _judge(name: str, before: Intent, after: Intent, action: StickAction | None, known: Known) -> Known:
     """Follow what the program said; raise Finding."""
-    owes = after.held_back is not None
+    owes = after.needs_neutral is not None
     if (
         name in ("motion", "autonomous")
-        and action in (Action.SEND, Action.ACQUIRE, Action.WAIT)
+        and action in (StickAction.SEND, StickAction.ACQUIRE, StickAction.WAIT)
         and (known.owes and owes)
     ):
         raise Finding(f"{name} was {action} while neutral was owed: {before!r}")
-    if name == "motion" and action is Action.SEND and known.lease != "held":
+    if name == "motion" and action is StickAction.SEND and known.lease != "held":
         raise Finding(f"motion was sent without a lease: {before!r}")
-    if name == "motion" and action in (Action.SEND, Action.ACQUIRE) and before.mode == "none":
+    if name == "motion" and action in (StickAction.SEND, StickAction.ACQUIRE) and before.mode == "none":
         raise Finding(f"motion was {action} in mode none: {before!r}")
-    if action is Action.SEND and known.lease != "held":
+    if action is StickAction.SEND and known.lease != "held":
         raise Finding(f"{name} was sent without a lease: {before!r}")
     if known.owes and not owes and name not in ("neutral", "time", *MODES, "motion"):
         raise Finding(f"{name} paid a neutral: {before!r}")
-    lease = "asked" if action is Action.ACQUIRE else known.lease
-    if (lease == "held") != after.held or (lease == "asked") != after.asking:
+    lease = "asked" if action is StickAction.ACQUIRE else known.lease
+    if (lease == "held") != after.held or (lease == "asked") != (after.active and not after.held):
         raise Finding(f"after {name} the lease is {lease}, and the intent is {after!r}")
     return Known(lease, owes, after._moving)
 
 
-def _said(act: Callable[[Intent, float], Action]) -> Callable[[Intent, float], Action]:
-    def say(intent: Intent, now: float) -> Action:
+def _said(act: Callable[[Intent, float], StickAction]) -> Callable[[Intent, float], StickAction]:
+    def say(intent: Intent, now: float) -> StickAction:
         intent.heard(now)
         return act(intent, now)
 
     return say
 
 
-_MOVES: dict[str, Callable[[Intent, float], Action | None]] = {
+_MOVES: dict[str, Callable[[Intent, float], StickAction | None]] = {
     "motion": _said(lambda intent, now: intent.motion(now)),
     "motion once": _said(lambda intent, now: intent.motion(now, lasts=False)),
     "neutral": _said(lambda intent, now: intent.neutral(now)),
     "neutral of a part": _said(lambda intent, now: intent.neutral(now, whole=False)),
     **{mode: _said(lambda intent, now, mode=mode: intent.choose(mode, now)) for mode in MODES},  # type: ignore[misc]
+    "want": lambda intent, now: intent.want(now),
     "time": lambda intent, now: intent.expire(now),  # type: ignore[func-returns-value]
 }
 _NEWS: dict[str, Callable[[Intent, float], None]] = {

@@ -20,6 +20,7 @@ HOLDERS = "zbridge/control/holders.py"
 ENFORCER = "zbridge/control/enforcer.py"
 LATCH = "zbridge/control/latch.py"
 INTENT = "zbridge/hq/intent.py"
+STICK = "zbridge/lease/stick.py"
 OWNERSHIP = "zbridge/robot/ownership.py"
 COMMANDS = "zbridge/robot/commands.py"
 DEVICE = "zbridge/robot/device.py"
@@ -379,16 +380,16 @@ MUTANTS = (
     Mutant(
         "HQ deadman ignored",
         "hq",
-        INTENT,
-        "        if self._moving and now - self._moved_at >= self.deadman_s:",
+        STICK,
+        "        if self._moving and now >= self._moved_at + self.deadman_s:",
         "        if False:",
     ),
     Mutant(
         "HQ programs need no neutral",
         "hq",
-        INTENT,
-        "            Input.MOTION: (Action.REFUSE, State.IDLE_OWES),",
-        "            Input.MOTION: (Action.ACQUIRE, State.ASKING),",
+        STICK,
+        "            StickInput.MOTION: (StickAction.REFUSE, None),\n            StickInput.NEUTRAL",
+        "            StickInput.MOTION: (StickAction.ACQUIRE, StickState.ASKING),\n            StickInput.NEUTRAL",
     ),
     Mutant(  # both: what holds the lease gives it back with its token
         "a lost HQ program keeps the lease",
@@ -408,9 +409,9 @@ MUTANTS = (
     Mutant(
         "HQ programs hold the robot for ever",
         "situations",
-        INTENT,
-        "        return self.held and now - used_at >=",
-        "        return self.held and now - used_at >= 1000 +",
+        STICK,
+        "now >= self._last_used() + self.idle_s",
+        "now >= self._last_used() + 1000",
     ),
     # what is shown
     Mutant(  # both: what is not published at once is published 0.05 s later

@@ -10,13 +10,16 @@ import sys
 import termios
 import tty
 from collections.abc import Callable, Iterator
+from functools import partial
 
 from zbridge.bus import BusSettings
 from zbridge.cli.keyboard import Keyboard, split_keys
-from zbridge.client import Driver, Robot, connect
+from zbridge.client import Robot, connect
+from zbridge.client.pilot import Pilot
 from zbridge.errors import BusError, LeaseLost, Refused, ZbridgeError
 from zbridge.fleet.messages import Drive
 from zbridge.fleet.printable import shown
+from zbridge.lease.stick import Stick, StickRules
 
 EVERY_S = 0.05
 DEADMAN_S = 0.3
@@ -32,8 +35,9 @@ class Session:
     def __init__(self, robot: Robot, speed: float, *, who: str | None, takeover: bool) -> None:
         self._robot = robot
         self._keyboard = Keyboard(speed)
-        self._who = who
-        self._takeover = takeover
+        lease = partial(robot.control, who, deadman_s=DEADMAN_S, takeover=takeover)
+        self._pilot = Pilot(Stick(StickRules()), lease, on_end=self._on_end)
+        self._failure: ZbridgeError | None = None
         self._keys: asyncio.Queue[tuple[str, float]] = asyncio.Queue(_READ_BYTES)
         self._loop = asyncio.get_running_loop()
         self._line = ""
@@ -42,46 +46,45 @@ class Session:
         """Drive until ``x``; a lost lease is taken again with Enter."""
         print(_HELP, f"waiting for the gateway of {self._robot.name}", sep="\n")  # noqa: T201
         with _raw_keys(self._loop, self._take):
-            while True:
-                try:
-                    async with self._robot.control(self._who, deadman_s=DEADMAN_S, takeover=self._takeover) as drive:
-                        await self._drive(drive)
-                        return
-                except LeaseLost as loss:
-                    self._say(f"{loss}. Enter: take the lease again, x: end")
-                if not await self._again():
-                    return
-
-    async def _drive(self, drive: Driver) -> None:
-        """Send the drive that the keys stand for, until ``x``."""
-        while True:
-            while not self._keys.empty():
-                key, at = self._keys.get_nowait()
-                if key == "x":
-                    return
-                if key == " ":
-                    await self._stop()
-                else:
-                    self._keyboard.press(key, at)
-            command = self._keyboard.drive(self._loop.time())
+            self._pilot.take()
             try:
-                await drive(command.forward, command.left, command.turn)
-                self._show(command)
-            except LeaseLost:
-                raise
-            except Refused as refusal:
-                self._say(str(refusal))
-            await asyncio.sleep(EVERY_S)
+                while await self._obey_keys():
+                    if self._pilot.stick.held:
+                        self._drive()
+                    await asyncio.sleep(EVERY_S)
+            finally:
+                await self._pilot.close()
 
-    async def _again(self) -> bool:
-        while True:
-            match (await self._keys.get())[0]:
-                case "\r" | "\n":
-                    return True
-                case "x":
-                    return False
-                case " ":
-                    await self._stop()
+    async def _obey_keys(self) -> bool:
+        """Carry out what was pressed; False: to end. Raises why the lease was not granted, or nothing can be sent."""
+        while not self._keys.empty():
+            key, at = self._keys.get_nowait()
+            if key == "x":
+                return False
+            if key == " ":
+                await self._stop()
+                continue
+            self._keyboard.press(key, at)
+            if key in ("\r", "\n"):
+                self._pilot.take()
+        if self._failure is not None:
+            raise self._failure
+        return True
+
+    def _drive(self) -> None:
+        """Send the drive that the keys stand for."""
+        command = self._keyboard.drive(self._loop.time())
+        try:
+            self._pilot.drive(command)
+            self._show(command)
+        except Refused as refusal:
+            self._say(str(refusal))
+
+    def _on_end(self, error: ZbridgeError | None) -> None:
+        if isinstance(error, LeaseLost):
+            self._say(f"{error}. Enter: take the lease again, x: end")
+        else:
+            self._failure = error
 
     async def _stop(self) -> None:
         try:

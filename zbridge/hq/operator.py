@@ -19,10 +19,11 @@ from zbridge.fleet.messages import Acquire, Control, Drive, FleetMessage, Mode, 
 from zbridge.fleet.topics import Topic
 from zbridge.hq.bridge import Bridge
 from zbridge.hq.command_queue import CommandQueue
-from zbridge.hq.intent import Action, Intent
+from zbridge.hq.intent import Intent
 from zbridge.lease.lease_client import LeaseClient
 from zbridge.lease.lease_events import LeaseEvent, LeaseEventKind
 from zbridge.lease.lease_holder import LeaseHolder
+from zbridge.lease.stick import StickAction
 from zbridge.protocol.kept import Exported
 from zbridge.protocol.rate_limit import RateLimit
 
@@ -82,7 +83,7 @@ class Operator:
     @property
     def active(self) -> bool:
         """Whether :meth:`tick` has anything to do."""
-        return self.intent.held or self.intent.asking
+        return self.intent.active
 
     # What the client says
 
@@ -110,7 +111,7 @@ class Operator:
         intent.expire(now)
         if not intent.held:
             return
-        if intent.held_back is not None:
+        if intent.needs_neutral is not None:
             self._set.clear()
         if intent.wants_release(now):
             self._release("unused")
@@ -119,10 +120,10 @@ class Operator:
         self._lease.expire()
 
     def repeat(self) -> None:
-        """Send again what is in motion, unless neutral is owed."""
+        """Send again what is in motion, unless neutral is needed."""
         now, intent = self._clock(), self.intent
         intent.expire(now)
-        if intent.held and intent.held_back is None:
+        if intent.held and intent.needs_neutral is None:
             for topic, message in tuple(self._set.values()):
                 intent.motion(now)
                 self._queue.send(topic, message)
@@ -173,7 +174,7 @@ class Operator:
     def _move(self, topic: Topic, message: Drive | Motor, now: float) -> None:
         intent = self.intent
         intent.expire(now)
-        if intent.held_back is not None:
+        if intent.needs_neutral is not None:
             self._set.clear()
         if not self._is_motion(message):
             if isinstance(message, Drive) and message.moving and not intent.may_steer:
@@ -197,21 +198,21 @@ class Operator:
                 self._choose(Mode("manual"), now)
                 raise Unsupported("the robot does not move by itself, only by the stick")
         do = self.intent.choose(message.mode, now)
-        if do is Action.RELEASE:
+        if do is StickAction.RELEASE:
             self._tell_mode(self._queue.put)  # what waits is dropped, so it overtakes nothing
             self._release("control mode none")
-        elif do is Action.ACQUIRE:
+        elif do is StickAction.ACQUIRE:
             self._lease.want()
-        elif do is Action.SEND:
+        elif do is StickAction.SEND:
             self._tell_mode(self._queue.send)
 
-    def _follow(self, do: Action, topic: Topic, message: FleetMessage) -> None:
+    def _follow(self, do: StickAction, topic: Topic, message: FleetMessage) -> None:
         match do:
-            case Action.SEND:
+            case StickAction.SEND:
                 self._queue.send(topic, message)
-            case Action.WAIT:
+            case StickAction.WAIT:
                 self._queue.wait(topic, message)
-            case Action.ACQUIRE:
+            case StickAction.ACQUIRE:
                 self._queue.wait(topic, message)
                 self._lease.want()
 
@@ -238,8 +239,7 @@ class Operator:
             self._tell(f"not driving: {why}")
 
     def _begin(self, lease_s: float | None) -> None:
-        intent = self.intent
-        intent.granted(lease_s or intent.lease_s)
+        self.intent.granted(lease_s)
         waiting = self._queue.begin()
         self._tell_mode(self._queue.send)
         self._queue.resume(waiting)
@@ -259,4 +259,4 @@ class Operator:
     def _late(self) -> bool:
         """Return whether neutral must come before motion."""
         self.intent.expire(self._clock())
-        return self.intent.held_back is not None
+        return self.intent.needs_neutral is not None

@@ -11,7 +11,8 @@ from zbridge.errors import Refused
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Mode, Scan, Text
 from zbridge.fleet.topics import Topic
-from zbridge.hq.intent import Action, Intent
+from zbridge.hq.intent import Intent
+from zbridge.lease.stick import StickAction
 from zbridge.protocol.session import State
 
 OLD, NEW = "tcpudp-1.1-tcp.hex", "tcpudp-1.3-udp.hex"
@@ -100,9 +101,9 @@ def test_the_shown_robot_is_what_the_captured_one_showed(name: str) -> None:
     assert recorded <= {(sent.by, sent.frame) for sent in client.sent}
 
 
-def carried_out(intent: Intent, commands: Commands) -> list[Action | str]:
+def carried_out(intent: Intent, commands: Commands) -> list[StickAction | str]:
     """What the intent makes of motion and modes; a refusal by its reason."""
-    done: list[Action | str] = []
+    done: list[StickAction | str] = []
     for at, _, command in commands:
         try:
             match command:
@@ -119,10 +120,10 @@ def carried_out(intent: Intent, commands: Commands) -> list[Action | str]:
 def test_a_captured_hq_drives_only_after_it_has_said_neutral_once(name: str) -> None:
     client = captured(name)
     intent = Intent(client.listener.deadman_s)
-    assert intent.choose("none", 0.0) is Action.NOTHING
+    assert intent.choose("none", 0.0) is StickAction.NOTHING
     owed = "connected: release the stick first"
-    assert carried_out(intent, replay(client, name)) == [Action.NOTHING, owed, owed, Action.NOTHING]
+    assert carried_out(intent, replay(client, name)) == [StickAction.NOTHING, owed, owed, StickAction.NOTHING]
     again = replay(client, name, late=10.0)
-    assert carried_out(intent, again) == [Action.NOTHING, Action.ACQUIRE, Action.WAIT, Action.WAIT]
+    assert carried_out(intent, again) == [StickAction.NOTHING, StickAction.ACQUIRE, StickAction.WAIT, StickAction.WAIT]
     intent.granted(3.0)
-    assert carried_out(intent, replay(client, name, late=20.0)) == [Action.SEND] * 4
+    assert carried_out(intent, replay(client, name, late=20.0)) == [StickAction.SEND] * 4

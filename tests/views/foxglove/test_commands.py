@@ -10,12 +10,11 @@ from typing import Any
 
 import pytest
 
-from zbridge.errors import BusError, Held, Malformed, NeutralFirst, Refused, TooFast, Unsupported
-from zbridge.views.foxglove.commands import RobotCommands
+from zbridge.errors import BusError, Held, Malformed, NeutralFirst, Refused, Unsupported
+from zbridge.fleet.messages import Drive
+from zbridge.views.foxglove.commands import DEADMAN_S, PAUSE_S, QUIET_S, RobotCommands
 from zbridge.views.foxglove.hub import Hub
-from zbridge.views.foxglove.pilot import DEADMAN_S, PAUSE_S, Pilot
-from zbridge.views.foxglove.requests import ClientChannel
-from zbridge.views.foxglove.twist import QUIET_S, Scale, Scales
+from zbridge.views.foxglove.requests import ClientChannel, Scale, Scales
 
 pytestmark = pytest.mark.jumping
 
@@ -31,8 +30,9 @@ class Driver:
         self.loss: Exception | None = None
         self.lost = asyncio.Event()
 
-    async def __call__(self, forward: float, left: float, turn: float) -> None:
-        self._robot.done.append((forward, left, turn))
+    def now(self, drive: Drive) -> bool:
+        self._robot.done.append((drive.forward, drive.left, drive.turn))
+        return True
 
     async def mode(self, mode: str) -> None:
         if self._robot.refuses is not None:
@@ -239,6 +239,7 @@ async def test_a_fault_of_ours_is_told_too(scene: Scene) -> None:
     await soon()
     assert "what" in scene.viewer.warned[0]
     scene.r1.refuses = None
+    scene.twist(0.0)
     scene.twist(1.0)
     await soon()
     assert scene.r1.driver is not None
@@ -449,15 +450,3 @@ async def test_a_mode_that_is_refused_is_told_and_leaves_none(scene: Scene) -> N
     with pytest.raises(Unsupported, match="no modes"):
         await scene.call("/r1/mode", mode="manual")
     assert scene.commands.parameters(("r1.mode",)) == {"r1.mode": "none"}
-
-
-async def test_modes_that_wait_are_bounded_and_end_with_the_viewer(scene: Scene) -> None:
-    pilot = Pilot(scene.r1, "ann", "foxglove", scene.viewer.warn, lambda mode: None)  # type: ignore[arg-type]
-    scene.r1.grants.clear()
-    waiting = [asyncio.ensure_future(pilot.set_mode("manual")) for _ in range(8)]
-    await soon()
-    with pytest.raises(TooFast, match="too many changes of the mode"):
-        await pilot.set_mode("manual")
-    await pilot.end()
-    outcomes = await asyncio.gather(*waiting, return_exceptions=True)
-    assert {str(outcome) for outcome in outcomes} == {"the robot was released"}

@@ -16,7 +16,7 @@ from zbridge.metrics import Metrics
 from zbridge.views.foxglove.commands import RobotCommands
 from zbridge.views.foxglove.hub import Hub
 from zbridge.views.foxglove.live import LiveSource
-from zbridge.views.foxglove.twist import Scales
+from zbridge.views.foxglove.requests import Scales
 
 GATEWAY = "fleet/r1/@alive/gateway"
 

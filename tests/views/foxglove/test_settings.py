@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from zbridge.errors import ConfigError
+from zbridge.views.foxglove.requests import Scale
 from zbridge.views.foxglove.settings import FoxgloveOptions, plan
-from zbridge.views.foxglove.twist import Scale
 
 GOOD, SHORT, SPOILED = "a" * 32, "short", "with space and more letters"
 

@@ -1,12 +1,10 @@
-"""Twists as fractions of full scale, and what a viewer owes before it may move a robot again."""
-
-import math
+"""Twists as fractions of full scale."""
 
 import pytest
 
 from zbridge.errors import Malformed
 from zbridge.fleet.messages import Drive
-from zbridge.views.foxglove.twist import Debt, Scale, Scales, read_twist
+from zbridge.views.foxglove.requests import Scale, Scales, read_twist
 
 FAST = Scale(speed_full_mps=2.0, turn_full_radps=4.0)
 
@@ -42,17 +40,3 @@ def test_a_robot_without_a_scale_has_that_of_the_others() -> None:
     scales = Scales(Scale(0.5, 1.5), {"r2": FAST})
     assert scales.of("r1") == Scale(0.5, 1.5)
     assert scales.of("r2") == FAST
-
-
-def test_who_lost_the_robot_owes_a_zero_or_a_second_of_silence() -> None:
-    debt = Debt()
-    assert debt.pays(moving=True, now=0.0)
-    debt.owe("stopped")
-    assert not debt.pays(moving=True, now=0.1)
-    assert not debt.pays(moving=True, now=1.0)  # pressed all the time: no silence
-    assert debt.pays(moving=False, now=1.1)
-    assert debt.pays(moving=True, now=1.2)
-    debt.owe("stopped")
-    assert not debt.pays(moving=True, now=2.1)
-    assert debt.pays(moving=True, now=3.1)
-    assert math.isfinite(3.1)

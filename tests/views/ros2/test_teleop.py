@@ -18,7 +18,7 @@ from zbridge.metrics import Metrics
 from zbridge.ros2 import KEEP_LAST_10, Attachment, Endpoint, Kind, Node, types_of
 from zbridge.views.ros2.cmd_vel import TWIST
 from zbridge.views.ros2.diagnostics import OK, WARN
-from zbridge.views.ros2.driving import PUBLISHERS, Standing
+from zbridge.views.ros2.driving import PUBLISHERS
 from zbridge.views.ros2.outlets import RosSide
 from zbridge.views.ros2.settings import RobotBody
 from zbridge.views.ros2.teleop import ASK_S, RATE_HZ, SETTLE_S, STRANGERS_HZ, Teleop
@@ -42,6 +42,10 @@ class Scene:
         """What is called for a sample, by its key; also after the end."""
         ((_, self.on_token),) = self.bus.network.watchers
         self.sort: Any = self.bus.network.lanes[self.endpoint().key]
+
+    def needing(self) -> list[bool]:
+        """Which publishers need neutral."""
+        return [each.stick.needs_neutral is not None for each in self.driving.publishers.values()]
 
     def counted(self, what: str) -> int:
         return self.side.metrics.total(f"ros2_cmd_vel_{what}")
@@ -73,7 +77,7 @@ async def test_a_publisher_whose_token_came_unheard_is_found_when_it_commands_an
     scene.put(endpoint)
     assert scene.driving.publishers == {}
     await asyncio.sleep(ASK_S / 2)
-    assert [each.standing for each in scene.driving.publishers.values()] == [Standing.OWES]
+    assert scene.needing() == [True]
     await scene.teleop.close()
 
 
@@ -148,7 +152,7 @@ async def test_a_stick_that_was_held_while_ros_s_router_was_away_owes_whatever_w
     scene.teleop.connected(True)
     scene.on_token(stick.token(), True)
     scene.put(stick)
-    assert [each.standing for each in scene.driving.publishers.values()] == [Standing.OWES]
+    assert scene.needing() == [True]
     await scene.teleop.close()
 
 
@@ -161,7 +165,7 @@ async def test_a_twist_that_waited_until_the_end_takes_no_robot() -> None:
     await asyncio.sleep(0)
     scene.put(stick)
     await closing
-    assert scene.driving.holder is None
+    assert scene.driving.driver is None
 
 
 # What is heard at all, and what is told
@@ -182,8 +186,8 @@ async def test_what_a_known_publisher_sends_is_taken_at_a_bounded_rate_and_stran
     assert STRANGERS_HZ <= lanes(stranger, 1000) < 2 * STRANGERS_HZ
     assert scene.counted("strangers") == 1000
     assert scene.counted("too_fast") > 500
-    scene.driving.holder = known.gid()
-    await asyncio.sleep(1.0)
+    await asyncio.sleep(2 * SETTLE_S)
+    scene.put(known)
     beside = Attachment(1, 1, known.gid()).encode()
     assert scene.sort("key", beside, len(FORWARD), lambda: FORWARD) is Lane.COMMAND
     await scene.teleop.close()
@@ -225,8 +229,8 @@ async def test_a_robot_that_somebody_stops_is_owed_a_zero_by_its_publishers() ->
     states = []
     for state in ("free", "held", "stopped"):
         scene.control(state)
-        states.append([each.standing for each in scene.driving.publishers.values()])
-    assert states == [[Standing.FREE], [Standing.FREE], [Standing.OWES]]
+        states.append(scene.needing())
+    assert states == [[False], [False], [True]]
     told = scene.teleop.diagnostics()
     assert told.level == WARN
     assert "the robot was stopped: send a zero, or nothing for a second, then drive" in told.message
@@ -242,7 +246,7 @@ async def test_a_robot_that_was_stopped_already_asks_nothing_of_who_comes() -> N
     for state in ("latched", "stopped"):
         scene.control(state)
     scene.fleet.publisher("fleet/r1/control", topics.CONTROL).put(b"?")
-    assert [each.standing for each in scene.driving.publishers.values()] == [Standing.FREE]
+    assert scene.needing() == [False]
     await scene.teleop.close()
 
 
@@ -253,5 +257,5 @@ async def test_garbage_of_a_publisher_is_counted_and_moves_nothing() -> None:
     for beside, payload in ((b"?", FORWARD), (Attachment(1, 1, endpoint.gid()).encode(), FORWARD[:20])):
         scene.takes[endpoint.key](Sample(endpoint.key, payload, beside))
     assert scene.counted("malformed") == 2
-    assert scene.driving.holder is None
+    assert scene.driving.driver is None
     await scene.teleop.close()

@@ -17,22 +17,38 @@ from __future__ import annotations
 import asyncio
 import itertools
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import msgspec
 
 from zbridge.client import Fleet
+from zbridge.client.pilot import Pilot
 from zbridge.client.stops import Outcome
 from zbridge.errors import Held, Malformed, Unsupported, ZbridgeError
 from zbridge.fleet.topics import is_name
+from zbridge.lease.stick import Stick, StickRules
 from zbridge.views.foxglove import replies
 from zbridge.views.foxglove.hub import Hub, Subscriber
-from zbridge.views.foxglove.pilot import Pilot
 from zbridge.views.foxglove.replies import Service
-from zbridge.views.foxglove.requests import ClientChannel
+from zbridge.views.foxglove.requests import ClientChannel, Scales, read_twist
 from zbridge.views.foxglove.source import ViewerCommands
-from zbridge.views.foxglove.twist import Scales, read_twist
 
+DEADMAN_S = 0.5
+"""The gateway stops a robot whose viewer's Twists stay away so long, should this process be gone or stand still."""
+PAUSE_S = 0.4
+"""Silence after which a robot is stopped and released: before the deadman, so that the next Twist may be motion."""
+QUIET_S = 1.0
+"""Silence after which a viewer may move a robot again that was taken from it."""
+WAIT_S = 2.0
+"""Longest wait for the robot's gateway."""
+RULES = StickRules(
+    keeps=False,
+    idle_s=PAUSE_S,
+    neutral_counts=True,
+    quiet_s=QUIET_S,
+    advice="; let go for a second, then drive",
+)
 CMD_VEL, STOP, LATCH, UNLATCH = "cmd_vel", "stop", "latch", "unlatch"
 _TWISTS = ("geometry_msgs/Twist", "geometry_msgs/msg/Twist")
 _SWITCHES = ("light", "lidar", "camera")
@@ -68,7 +84,7 @@ class RobotCommands(ViewerCommands):
 
     async def close(self) -> None:
         """Release all robots; stops that are on their way arrive."""
-        pilots = [pilot.end() for pilot in self._pilots.values()]
+        pilots = [pilot.close() for pilot in self._pilots.values()]
         await asyncio.gather(*pilots, *self._stops.values(), *self._releases, return_exceptions=True)
         self._pilots.clear()
 
@@ -120,7 +136,7 @@ class RobotCommands(ViewerCommands):
         robot, _, what = channel.topic.strip("/").partition("/")
         pilot = self._pilots.pop((viewer, robot), None) if what == CMD_VEL else None
         if pilot is not None:
-            task = asyncio.get_running_loop().create_task(pilot.end())
+            task = asyncio.get_running_loop().create_task(pilot.close())
             self._releases.add(task)
             task.add_done_callback(self._releases.discard)
 
@@ -138,11 +154,15 @@ class RobotCommands(ViewerCommands):
         pilot = self._pilots.get((viewer, robot))
         if pilot is None:
 
-            def mode_ended(mode: str) -> None:
-                self.noted(robot, "mode", mode)
+            def ended(error: ZbridgeError | None) -> None:
+                if made.mode != "none":
+                    self.noted(robot, "mode", "none")
+                if error is not None:
+                    viewer.warn(str(error))
 
-            pilot = Pilot(self._fleet[robot], viewer.name, self._who, viewer.warn, mode_ended)
-            self._pilots[viewer, robot] = pilot
+            control = self._fleet[robot].control
+            lease = partial(control, viewer.name, name=self._who, deadman_s=DEADMAN_S, wait_s=WAIT_S)
+            pilot = self._pilots[viewer, robot] = made = Pilot(Stick(RULES), lease, on_end=ended)
         return pilot
 
     def _stop_soon(self, viewer: Subscriber, robot: str) -> None:
@@ -168,7 +188,7 @@ class RobotCommands(ViewerCommands):
     def _stopped(self, robots: list[str]) -> None:
         for (_, robot), pilot in self._pilots.items():
             if robot in robots:
-                pilot.stopped()
+                pilot.hold_back(f"{robot} was stopped")
 
     async def _stop(self, robots: list[str]) -> None:
         """Stop robots; raise Refused or BusError for the first that was not confirmed."""
@@ -244,14 +264,14 @@ class RobotCommands(ViewerCommands):
 
     async def _set_mode(self, viewer: Subscriber, robot: str, mode: str) -> None:
         for (other, held), pilot in self._pilots.items():
-            if held == robot and other is not viewer and pilot.at_work:
+            if held == robot and other is not viewer and pilot.stick.active:
                 raise Held(f"{robot} is driven by {other.name}", holder=other.name)
         await self._pilot(viewer, robot).set_mode(mode)
 
     async def left(self, viewer: Subscriber) -> None:
         """Release all robots of a viewer that is gone."""
         gone = [key for key in self._pilots if key[0] is viewer]
-        await asyncio.gather(*(self._pilots.pop(key).end() for key in gone))
+        await asyncio.gather(*(self._pilots.pop(key).close() for key in gone))
 
     def _known(self, robot: str) -> None:
         if robot not in self._robots:

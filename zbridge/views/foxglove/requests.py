@@ -1,17 +1,20 @@
 """What viewers send in ``foxglove.sdk.v1``, Foxglove's WebSocket protocol. Sans-IO.
 
 Text messages are JSON objects with an ``op``; binary ones begin with an opcode, and their numbers are little-endian.
-Reading raises ProtocolError and nothing else.
+Reading raises ProtocolError and nothing else; of a Twist, Malformed.
 """
 
 from __future__ import annotations
 
+import math
 import struct
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import msgspec
 
-from zbridge.errors import ProtocolError
+from zbridge.errors import Malformed, ProtocolError
+from zbridge.fleet.messages import Drive
 
 LISTED = 4096
 """Most entries of a list in one message."""
@@ -130,6 +133,35 @@ class PlaybackRequest(msgspec.Struct, frozen=True):
     request_id: str
 
 
+class Scale(msgspec.Struct, frozen=True):
+    """The speeds of a robot at full scale: m/s over ground, and rad/s."""
+
+    speed_full_mps: float = 1.0
+    turn_full_radps: float = 1.0
+
+
+class Scales(msgspec.Struct, frozen=True):
+    """The scales of robots by name, and of all others."""
+
+    others: Scale = Scale()
+    robots: Mapping[str, Scale] = {}
+
+    def of(self, robot: str) -> Scale:
+        """Return the scale of a robot."""
+        return self.robots.get(robot, self.others)
+
+
+class _Vector(msgspec.Struct, frozen=True):
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+
+
+class _Twist(msgspec.Struct, frozen=True):
+    linear: _Vector = _Vector()
+    angular: _Vector = _Vector()
+
+
 TextMessage = (
     Subscribe
     | Unsubscribe
@@ -141,6 +173,7 @@ TextMessage = (
     | UnsubscribeParameterUpdates
 )
 _TEXT_MESSAGES: msgspec.json.Decoder[TextMessage] = msgspec.json.Decoder(TextMessage)
+_TWIST = msgspec.json.Decoder(_Twist)
 _U32 = struct.Struct("<I")
 _CALL = struct.Struct("<III")
 _PLAYBACK = struct.Struct("<BfBQI")
@@ -168,6 +201,24 @@ def read_binary(data: bytes) -> Published | ServiceCall | PlaybackRequest:
     except (struct.error, UnicodeError) as error:
         raise ProtocolError(f"binary message of {len(data)} bytes: {error}") from error
     raise ProtocolError(f"binary message with the opcode {data[:1].hex() or 'of nothing'}")
+
+
+def read_twist(payload: bytes, scale: Scale) -> Drive:
+    """Read a Twist in JSON; raise Malformed. Above full scale all parts are scaled down alike: the curve stays."""
+    try:
+        twist = _TWIST.decode(payload)
+    except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
+        raise Malformed(f"Twist: {error}") from error
+    parts = (
+        twist.linear.x / scale.speed_full_mps,
+        twist.linear.y / scale.speed_full_mps,
+        twist.angular.z / scale.turn_full_radps,
+    )
+    if not all(map(math.isfinite, parts)):
+        raise Malformed("Twist: expected finite numbers")
+    most = max(1.0, *map(abs, parts))
+    forward, left, turn = (max(-1.0, min(1.0, part / most)) for part in parts)
+    return Drive(forward=forward, left=left, turn=turn)
 
 
 def _playback(data: bytes) -> PlaybackRequest:

@@ -13,7 +13,7 @@ from zbridge.fleet.topics import is_name
 from zbridge.protocol.address import Address
 from zbridge.protocol.networks import is_loopback, parse_network
 from zbridge.views.foxglove.admission import FOXGLOVE_ORIGINS, Policy
-from zbridge.views.foxglove.twist import Scale, Scales
+from zbridge.views.foxglove.requests import Scale, Scales
 
 TOKEN_CHARACTERS = 16
 """The shortest token."""

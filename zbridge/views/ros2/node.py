@@ -16,12 +16,11 @@ from zbridge.fleet.messages import Devices, FleetMessage
 from zbridge.fleet.topics import KeySpace, Topic, is_concrete
 from zbridge.ros2 import Kind
 from zbridge.views.live_robots import OnDemandSubscriptions, read_payload
-from zbridge.views.ros2.holder import NAME
 from zbridge.views.ros2.outlets import Outlet, RosSide
 from zbridge.views.ros2.pictures import TOPICS, RosPictures, RosTopic
 from zbridge.views.ros2.services import Services
 from zbridge.views.ros2.settings import RobotBody
-from zbridge.views.ros2.teleop import Teleop
+from zbridge.views.ros2.teleop import NAME, Teleop
 
 NODE = "zbridge"
 """The name of each robot's node, in the robot's namespace."""

@@ -4,7 +4,8 @@ Theory of operation. A liveliness watch knows the publishers by their tokens, an
 Zenoh loses the news of some tokens while many come and go at once: they are asked for again, at most every
 :data:`ASK_S`, where somebody unknown commands or there is no place for another publisher.
 :meth:`Teleop._sort` runs on Zenoh's threads: it drops what no known publisher sent, and what comes faster than
-:data:`RATE_HZ`, before the event loop receives it. The rest is read (``cmd_vel``), and carried out by ``holder``.
+:data:`RATE_HZ`, before the event loop receives it. The rest is read (``cmd_vel``), and carried out by the publisher's
+pilot.
 """
 
 from __future__ import annotations
@@ -15,18 +16,23 @@ from functools import partial
 
 from zbridge.bus import Bus, Handle, Lane, Look, Sample
 from zbridge.client import Robot
-from zbridge.errors import BusError, Malformed, PayloadError, ProtocolError, Unsupported
+from zbridge.client.pilot import Pilot
+from zbridge.errors import BusError, Malformed, PayloadError, ProtocolError, Refused, Unsupported
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import Control, Drive
+from zbridge.lease.stick import Stick
 from zbridge.protocol.rate_limit import RateLimit
 from zbridge.ros2 import KEEP_LAST_10, Endpoint, Kind, Node, endpoints_of, read_attachment, read_token
 from zbridge.views.ros2.cmd_vel import MOST_BYTES, read_twist
 from zbridge.views.ros2.diagnostics import MOST_VALUES, OK, WARN, Diagnostic, cut
-from zbridge.views.ros2.driving import PUBLISHERS, QUIET_S, Action, Decision, Driving, Standing
-from zbridge.views.ros2.holder import Holder
+from zbridge.views.ros2.driving import DEADMAN_S, PUBLISHERS, QUIET_S, RULES, Driving
 from zbridge.views.ros2.outlets import RosSide
 from zbridge.views.ros2.settings import RobotBody
 
+NAME = "ros2"
+"""The first part of a driver's name where no certificate says another; the publisher's node follows."""
+WAIT_S = 2.0
+"""Longest wait for the robot's gateway."""
 RATE_HZ = 200.0
 """Commands a second of one publisher that are heard."""
 STRANGERS_HZ = 5.0
@@ -55,7 +61,10 @@ class Teleop:
         self._body = body
         self._loop = asyncio.get_running_loop()
         self._driving = Driving(robot.name)
-        self._holder = Holder(robot, name, self._on_lost)
+        self._name = name
+        self._pilots: dict[bytes, Pilot] = {}
+        """By the gids of the publishers that are known."""
+        self._turn = asyncio.Lock()
         self._fleet = fleet
         self._control_key = control_key
         self._control: Handle | None = None
@@ -73,7 +82,6 @@ class Teleop:
         """Tokens that went while the answer was on its way."""
         self._wrong: dict[str, str] = {}
         """By the tokens of publishers of another type, what they are."""
-        self._timer: asyncio.TimerHandle | None = None
         self._counts = {name: side.metrics.count(f"ros2_cmd_vel_{name}") for name in _COUNTS}
         self._settled_at = self._loop.time() + SETTLE_S
         self.topic = f"{node.namespace}/cmd_vel"
@@ -99,10 +107,12 @@ class Teleop:
         for handle in handles:
             handle.close()
         self._watch_control(False)
-        for waiting in (self._timer, self._asking):
-            if waiting is not None:
-                waiting.cancel()
-        await self._holder.close()
+        if self._asking is not None:
+            self._asking.cancel()
+        for pilot in self._pilots.values():
+            pilot.release()
+        async with self._turn:  # publishers that are gone may still release the robot
+            pass
 
     # Who is there
 
@@ -132,6 +142,8 @@ class Teleop:
             self._forget(token)
         elif self._driving.came(gid, endpoint.node.full_name, now, early=late or now < self._settled_at):
             self._tokens[token] = gid
+            if gid not in self._pilots:
+                self._pilots[gid] = self._pilot(gid)
             self._limits.setdefault(gid, RateLimit(RATE_HZ))
             self._known.update(dict.fromkeys(endpoint.gids(), gid))
         else:
@@ -158,7 +170,17 @@ class Teleop:
         for also in [also for also, known in self._known.items() if known == gid]:
             del self._known[also]
         self._limits.pop(gid, None)
-        self._carry_out(self._driving.gone(gid))
+        self._driving.gone(gid)
+        pilot = self._pilots.pop(gid, None)
+        if pilot is not None:
+            pilot.release()
+
+    def _pilot(self, gid: bytes) -> Pilot:
+        """Make the pilot of a publisher: one after the other may ask for the robot."""
+        publisher = self._driving.publishers[gid]
+        who = f"{self._name}.{publisher.name.strip('/')}"
+        control = partial(self._robot.control, who, name=self._name, deadman_s=DEADMAN_S, wait_s=WAIT_S)
+        return Pilot(publisher.stick, control, turn=self._turn)
 
     def _ask(self) -> None:
         """Ask who is there, now and then."""
@@ -178,7 +200,7 @@ class Teleop:
         finally:
             if self._asking is asyncio.current_task():
                 self._asking = None
-        heard_at = {gid: publisher.heard_at for gid, publisher in self._driving.publishers.items()}
+        heard_at = {gid: publisher.stick.heard_at for gid, publisher in self._driving.publishers.items()}
         for token in known - alive:
             if heard_at.get(self._tokens.get(token, b""), math.inf) < asked_at - QUIET_S:
                 self._on_token(token, False)
@@ -206,8 +228,10 @@ class Teleop:
         self._stopped = stopped
 
     def stopped(self, why: str) -> None:
-        """The robot was stopped: whoever drives owes a zero or silence."""
-        self._carry_out(self._driving.stopped(why))
+        """The robot was stopped: whoever commands motion now meant it before."""
+        for pilot in self._pilots.values():
+            pilot.hold_back(why)
+            pilot.release()
 
     # What they command
 
@@ -225,7 +249,8 @@ class Teleop:
         if not limit.take(now):
             self._counts["too_fast"].value += 1
             return None
-        return Lane.COMMAND if gid == self._driving.holder else Lane.OTHER
+        driver = self._driving.driver
+        return Lane.COMMAND if driver is not None and driver is self._driving.publishers.get(gid) else Lane.OTHER
 
     def _take(self, type_name: str, sample: Sample) -> None:
         if not self._handles:  # it waited to be taken until nothing may be driven any more
@@ -242,56 +267,38 @@ class Teleop:
         gid = self._known.get(attachment.gid, attachment.gid)
         if gid not in self._limits:
             self._ask()
-        decision = self._driving.heard(gid, drive.moving, self._loop.time(), wrong)
-        if decision.action is Action.SEND:  # the way of nearly all
-            self._holder.send(drive)
-        else:
-            self._carry_out(decision, drive)
-        self._arm()
-
-    def _carry_out(self, decision: Decision, drive: Drive | None = None) -> None:
-        if decision.action is Action.ACQUIRE and drive is not None:
-            self._holder.acquire(decision.publisher, drive)
-        elif decision.action is Action.RELEASE:
-            self._holder.release()
-        elif decision.action is Action.REFUSE:
-            self._counts["refused"].value += 1
-
-    def _on_lost(self, why: str) -> None:
-        self._driving.lost(why)
-
-    def _arm(self) -> None:
-        """Wake at the deadline or before it: commands mostly put it off."""
-        deadline = self._driving.deadline()
-        if deadline is not None and self._timer is None:
-            self._timer = self._loop.call_at(deadline, self._expire)
-
-    def _expire(self) -> None:
-        self._timer = None
-        self._carry_out(self._driving.expire(self._loop.time()))
-        self._arm()
+        pilot = self._pilots.get(gid)
+        try:
+            self._driving.heard(gid, drive.moving, self._loop.time(), wrong)
+            if pilot is not None:
+                pilot.drive(drive)
+        except Refused:
+            if pilot is not None and pilot.stick.active:
+                pilot.release()
+            else:
+                self._counts["refused"].value += 1
 
     # What is told
 
     def diagnostics(self) -> Diagnostic:
         """Return who drives, and why others may not."""
         publishers = list(self._driving.publishers.values())[:MOST_VALUES]
-        values = [(cut(publisher.name), _standing(publisher.standing, publisher.why)) for publisher in publishers]
+        values = [(cut(publisher.name), _standing(publisher.stick)) for publisher in publishers]
         values += [("refused", cut(wrong)) for wrong in self._wrong.values()]
         values += [(name, str(count.value)) for name, count in self._counts.items() if count.value]
         driver = self._driving.driver
-        owing = [publisher for publisher in publishers if publisher.standing is Standing.OWES]
-        text = f"driven by {driver}" if driver else "nobody drives"
-        if owing:
-            text += f"; {owing[0].name} is refused: {_standing(Standing.OWES, owing[0].why)}"
-        level = WARN if owing or self._wrong else OK
+        refused = [publisher for publisher in publishers if publisher.stick.needs_neutral is not None]
+        text = f"driven by {driver.name}" if driver is not None else "nobody drives"
+        if refused:
+            text += f"; {refused[0].name} is refused: {_standing(refused[0].stick)}"
+        level = WARN if refused or self._wrong else OK
         return Diagnostic(level, f"{self._robot.name}: cmd_vel", cut(text), values[:MOST_VALUES])
 
 
-def _standing(standing: Standing, why: str) -> str:
-    if standing is not Standing.OWES:
-        return "drives" if standing is Standing.DRIVES else "may drive"
-    return cut(f"{why}: send a zero, or nothing for a second, then drive")
+def _standing(stick: Stick) -> str:
+    if stick.needs_neutral is None:
+        return "drives" if stick.active else "may drive"
+    return cut(f"{stick.needs_neutral}{RULES.advice}")
 
 
 _COUNTS = ("refused", "malformed", "strangers", "too_fast", "wrong_type", "tokens_unreadable", "publishers_refused")

@@ -16,7 +16,6 @@ import msgspec
 
 import zbridge
 from zbridge.app import until_signal
-from zbridge.app.tasks import together
 from zbridge.bus import BusSettings, read_key_expr
 from zbridge.bus.tls.member import own_name, own_role
 from zbridge.cli.bus import console, errors, joined, print_columns
@@ -28,6 +27,7 @@ from zbridge.fleet.topics import KeySpace, is_name
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.protocol.plugin import Protocol, find_protocol
+from zbridge.tasks import together
 from zbridge.views.recording.capture import BusCapture, RecordPlan, publish_mark
 from zbridge.views.recording.contents import Pictures, describe_configuration
 from zbridge.views.recording.export import export_arrays, export_tables, first_ns

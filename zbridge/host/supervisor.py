@@ -23,7 +23,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from zbridge.app.handover.processes import Systemd
-from zbridge.app.tasks import Background
 from zbridge.errors import ConfigError, HandoverError, NotReady
 from zbridge.host.files import Changes, Follower, RobotFile, compare, read_all
 from zbridge.host.fork_client import ForkClient, Stamp
@@ -31,6 +30,7 @@ from zbridge.host.process import GatewayProcess
 from zbridge.host.replacement import VERSION, SupervisorState, quiet_threads, release_signals, replace
 from zbridge.host.runner import Runner
 from zbridge.host.settings import HostSettings
+from zbridge.tasks import Tasks
 
 log = logging.getLogger("zbridge.host")
 
@@ -86,7 +86,7 @@ class Supervisor:
         self._runners: dict[Path, Runner] = {}
         self._leaving: set[Runner] = set()
         """Those whose file is gone, until their process has ended."""
-        self._running = Background()
+        self._running = Tasks()
         self._timer: asyncio.TimerHandle | None = None
         self._check_at = math.inf
         """When the watchdogs are checked next."""
@@ -119,7 +119,7 @@ class Supervisor:
                 await self._start_forks()
             self._code = self._forks.stamp
             for task in (self._follow(), self._live()):
-                self._running.run(task)
+                self._running.start(task)
             self._check_watchdogs()
             await self._apply(compare({}, files), first=True)
             self._all_started = True
@@ -142,7 +142,7 @@ class Supervisor:
         self._ends = True
         self._systemd.notify("STOPPING=1", f"STATUS=ending {len(self._runners)} gateways")
         await asyncio.gather(*(runner.end() for runner in (*self._runners.values(), *self._leaving)))
-        await self._running.cancel()
+        await self._running.end()
         for timer in (self._timer, self._status_timer):
             if timer is not None:
                 timer.cancel()
@@ -182,10 +182,10 @@ class Supervisor:
             self._faults[file.path] = str(file.fault)
         for path in changes.gone:
             log.info("%s: is gone: its robot's gateway ends", path)
-            self._running.run(self._leave(self._runners.pop(path)))
+            self._running.start(self._leave(self._runners.pop(path)))
         for file in changes.changed:
             log.info("%s: has changed", file.path)
-            self._running.run(self._runners[file.path].restart(file))
+            self._running.start(self._runners[file.path].restart(file))
         for path in [*changes.gone, *(file.path for file in (*changes.came, *changes.changed))]:
             self._faults.pop(path, None)
         for number, file in enumerate(changes.came):
@@ -194,7 +194,7 @@ class Supervisor:
             if not first:
                 log.info("%s: is new", file.path)
             self._runners[file.path] = runner = self._runner(file)
-            self._running.run(runner.run())
+            self._running.start(runner.run())
         self._state_changed()
 
     async def _leave(self, runner: Runner) -> None:
@@ -255,7 +255,7 @@ class Supervisor:
             file = RobotFile(Path(each.path), each.content, each.identity, forms=forms, shares=each.shares)
             self._runners[file.path] = runner = self._runner(file)
             runner.resume(each)
-            self._running.run(runner.run())
+            self._running.start(runner.run())
         release_signals()
         taken_ms = (time.monotonic() - state.at) * 1000
         log.info("the installed code has taken over in %.0f ms: %s", taken_ms, self.status)

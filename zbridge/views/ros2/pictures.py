@@ -23,13 +23,13 @@ from zbridge.fleet.messages import (
     Scanner,
     Status,
 )
+from zbridge.fleet.payload import measured_ns
 from zbridge.metrics import Metrics
 from zbridge.ros2 import KEEP_LAST_10, LATCHED, SENSOR_DATA, RosQoS, Types, ros_name
 from zbridge.views.ros2.description import Frames, urdf
 from zbridge.views.ros2.diagnostics import Diagnostic, entries_of
 from zbridge.views.ros2.settings import RobotBody
 from zbridge.views.ros2.shapes import Shapes, Speeds, speeds_of
-from zbridge.views.stamps import measured_ns
 
 LONGEST_S = 3.0
 """Nothing is added up over a longer pause: nobody knows what happened."""

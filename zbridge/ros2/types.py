@@ -58,6 +58,18 @@ class Types:
         """
         return self._make(type_name, fields)
 
+    def nested(self, type_name: str, fields: Mapping[str, Any]) -> Any:
+        """Make a message as :meth:`message` does, of fields that may be maps of fields, or lists of such maps."""
+        kinds = dict(self._store.fielddefs[type_name][1])
+        return self._make(type_name, {name: self._part(kinds[name], value) for name, value in fields.items()})
+
+    def _part(self, kind: Any, value: Any) -> Any:
+        if isinstance(value, dict):
+            return self.nested(kind[1], value)
+        if isinstance(value, list) and value and isinstance(value[0], dict):
+            return [self.nested(kind[1][0][1], item) for item in value]
+        return value
+
     def encode(self, message: Any) -> bytes:
         """Write a message as CDR, little-endian; raise EncodeError if a value does not fit."""
         try:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from zbridge.bus import Bus, Handle
@@ -38,14 +39,17 @@ class RosSide:
 
 
 class Outlet:
-    """One publisher. listened: called when the first subscriber comes and the last one goes."""
+    """One publisher. listened: called with it when the first subscriber comes (True) and the last one goes (False)."""
 
-    def __init__(self, side: RosSide, endpoint: Endpoint, listened: Callable[[bool], None], *, kept: int) -> None:
+    def __init__(
+        self, side: RosSide, endpoint: Endpoint, listened: Callable[[Outlet, bool], None], *, kept: int
+    ) -> None:
         self._side = side
         self._gid = endpoint.gid()
-        self._numbers: Iterator[int] = itertools.count(1)
+        self._numbers = itertools.count(1)
         best_effort = endpoint.qos.reliability is Reliability.BEST_EFFORT
-        self._publisher = side.bus.frames(endpoint.key, listened, best_effort=best_effort, kept=kept)
+        on_listened = partial(listened, self)
+        self._publisher = side.bus.frames(endpoint.key, on_listened, best_effort=best_effort, kept=kept)
         self._handles: tuple[Handle, ...] = (side.bus.announce(endpoint.token()), self._publisher)
 
     def __repr__(self) -> str:

@@ -41,14 +41,6 @@ class Policy(msgspec.Struct, frozen=True):
     who: str = "foxglove"
 
 
-class UpgradeRequest(msgspec.Struct, frozen=True):
-    """The opening handshake of a connection. origins, subprotocols: of all headers of that name."""
-
-    path: str
-    origins: Sequence[str]
-    subprotocols: Sequence[str]
-
-
 class Rejection(msgspec.Struct, frozen=True):
     """A connection that is turned away. reason: one word, for counters; text: for people."""
 
@@ -82,19 +74,21 @@ class ViewerAdmission:
             return "arrivals"
         return "full" if connections >= 2 * self.policy.viewers else None
 
-    def admit(self, request: UpgradeRequest, host: str, viewers: int) -> Admitted | Rejection:
-        """Decide about an opening handshake."""
-        if any(origin not in self.policy.origins for origin in request.origins):
+    def admit(
+        self, path: str, origins: Sequence[str], subprotocols: Sequence[str], host: str, viewers: int
+    ) -> Admitted | Rejection:
+        """Decide about an opening handshake. origins, subprotocols: of all headers of that name."""
+        if any(origin not in self.policy.origins for origin in origins):
             return Rejection(HTTPStatus.FORBIDDEN, "origin", "this Origin is not allowed")
-        query = parse_qs(urlsplit(request.path).query, max_num_fields=16)
+        query = parse_qs(urlsplit(path).query, max_num_fields=16)
         if self.policy.token is not None:
             given = query.get("token", [""])[0]
             if not hmac.compare_digest(given.encode(), self.policy.token.encode()):
                 return Rejection(HTTPStatus.UNAUTHORIZED, "token", "the token is missing or wrong")
         if viewers >= self.policy.viewers:
             return Rejection(HTTPStatus.SERVICE_UNAVAILABLE, "full", "as many viewers as there can be")
-        if SUBPROTOCOL not in request.subprotocols:
+        if SUBPROTOCOL not in subprotocols:
             return Rejection(HTTPStatus.BAD_REQUEST, "subprotocol", f"expected the subprotocol {SUBPROTOCOL}")
-        trusted = self.policy.token is not None or bool(request.origins)
+        trusted = self.policy.token is not None or bool(origins)
         name = escape(query.get("name", [""])[0] or host)[:LABEL]
         return Admitted(name, self.policy.drive and trusted)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -130,7 +131,6 @@ class Pictures:
         """Messages that could not be read."""
         self._make = FoxglovePictures
         self._robots: dict[str, FoxglovePictures] = {}
-        self._kinds: dict[ViewerChannel, ChannelKind] = {}
 
     def __repr__(self) -> str:
         return f"<Pictures of {len(self._robots)} robots>"
@@ -151,14 +151,12 @@ class Pictures:
             self.undrawn += 1
             return
         for picture in robot.draw(topic, message, now_ns):
-            yield self._kind(picture.channel), picture.stamp_ns, picture.payload
+            yield _drawn_on(picture.channel), picture.stamp_ns, picture.payload
 
-    def _kind(self, channel: ViewerChannel) -> ChannelKind:
-        kind = self._kinds.get(channel)
-        if kind is None:
-            schema = channel.schema
-            kind = self._kinds[channel] = ChannelKind(channel.topic, schema.message_encoding, schema)
-        return kind
+
+@lru_cache(maxsize=ROBOTS * 16)
+def _drawn_on(channel: ViewerChannel) -> ChannelKind:
+    return ChannelKind(channel.topic, channel.schema.message_encoding, channel.schema)
 
 
 _SECRET = re.compile(r"pass|secret|token|key|credential|private|auth", re.IGNORECASE)

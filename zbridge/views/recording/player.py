@@ -58,7 +58,6 @@ class PlaybackClock:
         self.playing, self.speed = True, speed
 
     def pause(self, now: float) -> None:
-        """Pause here."""
         self._set(self.now_ns(now), now)
         self.playing = False
 
@@ -119,7 +118,6 @@ class Player:
         return not self._time.playing
 
     def start(self) -> None:
-        """Begin to play."""
         self._thread.start()
 
     def pause(self) -> None:

@@ -40,7 +40,6 @@ class KeySummary(msgspec.Struct):
         return (self.count - 1) * 1e9 / span_ns if self.count > 1 and span_ns > 0 else 0.0
 
     def note(self, message: RecordedMessage) -> None:
-        """Count a message."""
         if self.count:
             self._judge((message.log_ns - self.last_ns) / 1e9)
         else:

@@ -29,11 +29,10 @@ from zbridge.transport.waiting import waiting_sockets
 
 
 class Shot(msgspec.Struct, frozen=True):
-    """One picture, and the stream it belongs to: ``answer`` is that stream's HTTP head. number: rises by one."""
+    """One picture, and the stream it belongs to. number: rises by one."""
 
     number: int
-    answer: bytes
-    boundary: bytes
+    stream: MjpegReader
     part: MjpegPart
 
 
@@ -51,7 +50,7 @@ class Latest:
     def show(self, stream: MjpegReader, part: MjpegPart) -> None:
         """Replace the picture by a newer one."""
         self._number += 1
-        self._shot = Shot(self._number, stream.head, stream.boundary, part)
+        self._shot = Shot(self._number, stream, part)
         self._came.set()
         self._came = asyncio.Event()
 
@@ -185,9 +184,9 @@ class Relay:
             async with asyncio.timeout(AWAY_S):
                 shot = await self._latest.after(number)
             if boundary is None:
-                boundary = shot.boundary
-                writer.write(shot.answer)
-            elif boundary != shot.boundary:
+                boundary = shot.stream.boundary
+                writer.write(shot.stream.head)
+            elif boundary != shot.stream.boundary:
                 return  # another camera answers now: the client cannot read its parts
             elif shot.number > number + 1:
                 self._skipped.value += shot.number - number - 1

@@ -83,11 +83,6 @@ class ViewerServer:
     @contextlib.asynccontextmanager
     async def serve(self) -> AsyncIterator[None]:
         """Serve viewers while the context lasts; ``address`` has the port then. Raise ConfigError for a bad address."""
-        owner_of_connections = self
-
-        class Guarded(_Guarded):
-            owner = owner_of_connections
-
         try:
             server = await serve(
                 self._serve,
@@ -97,7 +92,7 @@ class ViewerServer:
                 ssl_handshake_timeout=HANDSHAKE_S if self._tls is not None else None,
                 process_request=self._admit,
                 subprotocols=[Subprotocol(SUBPROTOCOL)],
-                create_connection=Guarded,
+                create_connection=type("Guarded", (_Guarded,), {"owner": self}),
                 compression=None,  # scans hardly shrink, and a core is worth more
                 server_header=None,
                 logger=_silent,

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 MSGPACK, OCTETS, JSON = "msgpack", "octet-stream", "json"
 SENT = "/@sent"
 """Ends the topic that stands beside a command's."""
-_TRANSPORT = "transport"
 
 
 class Sent(FleetMessage, frozen=True):
@@ -53,12 +52,12 @@ class Alive(FleetMessage, frozen=True):
 
 
 class ChannelKind(msgspec.Struct, frozen=True):
-    """A channel: what its messages are. metadata: pairs that tell channels of one topic apart."""
+    """A channel: what its messages are. datagram: raw frames that went by datagram."""
 
     topic: str
     encoding: str
     schema: Schema | None = None
-    metadata: tuple[tuple[str, str], ...] = ()
+    datagram: bool = False
 
 
 def message_of(key: str) -> type[FleetMessage] | None:
@@ -85,7 +84,7 @@ def is_wire(key: str) -> bool:
 def channel_of(key: str, *, datagram: bool = False) -> ChannelKind:
     """Describe the channel of a key."""
     if is_wire(key):
-        return ChannelKind(key, OCTETS, None, ((_TRANSPORT, "datagram"),) if datagram else ())
+        return ChannelKind(key, OCTETS, datagram=datagram)
     message = message_of(key)
     return ChannelKind(key, MSGPACK, schema_of(message) if message is not None else None)
 

@@ -32,6 +32,8 @@ TEXT_BYTES = 1024
 SCHEMA_BYTES = 2**20
 TABLES_BYTES = 64 * 2**20
 """Bytes of all channels, schemas and metadata together."""
+DATAGRAM = {"transport": "datagram"}
+"""The metadata of a channel whose raw frames went by datagram; it tells two channels of one topic apart."""
 _HEAD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _CHUNK = struct.Struct("<QQQI")
@@ -53,7 +55,7 @@ class RecordedChannel(msgspec.Struct, frozen=True):
     @property
     def datagram(self) -> bool:
         """Whether its raw frames went by datagram."""
-        return self.metadata.get("transport") == "datagram"
+        return DATAGRAM.items() <= self.metadata.items()
 
     def __hash__(self) -> int:
         return hash((self.topic, self.encoding, self.schema))

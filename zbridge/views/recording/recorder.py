@@ -38,14 +38,14 @@ _LEASES = 16
 _LATEST_NS = 2**63
 
 
-class _Stamp(msgspec.Struct, gc=False):
+class _StampedFields(msgspec.Struct, gc=False):
     """The fields of a payload that matter to a recording."""
 
     stamp_ns: int = -1
     seq: int = -1
 
 
-_read_stamp = msgspec.msgpack.Decoder(_Stamp).decode
+_read_stamp = msgspec.msgpack.Decoder(_StampedFields).decode
 
 
 class _Track(msgspec.Struct, eq=False):

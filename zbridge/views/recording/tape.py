@@ -22,7 +22,7 @@ import msgspec
 from zbridge.errors import ConfigError
 from zbridge.views.recording.contents import ChannelKind
 from zbridge.views.recording.intake import Losses
-from zbridge.views.recording.reader import EXTRA
+from zbridge.views.recording.reader import DATAGRAM, EXTRA
 
 CHUNK_BYTES = 2**20
 """Bytes of a chunk, uncompressed, about."""
@@ -168,7 +168,9 @@ class Tape:
             number = self._schemas[schema.name] = self._writer.register_schema(
                 schema.name, schema.encoding, schema.data
             )
-        channel: int = self._writer.register_channel(kind.topic, kind.encoding, number, dict(kind.metadata))
+        channel: int = self._writer.register_channel(
+            kind.topic, kind.encoding, number, DATAGRAM if kind.datagram else {}
+        )
         return channel
 
     def write(self, topic: str, channel: int, log_ns: int, publish_ns: int, sequence: int, data: bytes) -> None:

@@ -74,7 +74,6 @@ class Camera:
         return f"<Camera {self._plan.source} {self._demand!r}>"
 
     async def run(self) -> None:
-        """Serve the camera until cancelled."""
         watch = self._bus.watch_listeners(self._key, self._demand.listen)
         try:
             async with asyncio.TaskGroup() as tasks:

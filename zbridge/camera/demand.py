@@ -25,7 +25,6 @@ class Demand:
 
     @property
     def wanted(self) -> bool:
-        """Whether anybody watches."""
         return self.listened or self.clients > 0
 
     def listen(self, anybody: bool) -> None:

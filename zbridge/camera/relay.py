@@ -48,7 +48,6 @@ class Latest:
         return f"<Latest {self._number}>"
 
     def show(self, stream: MjpegReader, part: MjpegPart) -> None:
-        """Replace the picture by a newer one."""
         self._number += 1
         self._shot = Shot(self._number, stream, part)
         self._came.set()

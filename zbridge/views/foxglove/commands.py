@@ -90,7 +90,6 @@ class RobotCommands(ViewerCommands):
         self._hub.say(replies.text("unadvertiseServices", serviceIds=gone))
 
     def noted(self, robot: str, name: str, value: Any) -> None:
-        """Take note of a parameter's value."""
         if robot in self._robots and self._robots[robot].get(name) != value:
             self._robots[robot][name] = value
             self._hub.parameters_changed({f"{robot}.{name}": value})
@@ -179,7 +178,6 @@ class RobotCommands(ViewerCommands):
         return [service for _, _, service in self._services.values()]
 
     async def call(self, viewer: Subscriber, service_id: int, payload: bytes) -> bytes:
-        """Carry out a call; raise Refused or BusError."""
         if service_id not in self._services:
             raise Unsupported(f"there is no service {service_id}")
         robot, what, service = self._services[service_id]

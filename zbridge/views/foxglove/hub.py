@@ -129,7 +129,6 @@ class Hub:
             self.say(replies.warning(text, name))
 
     def parameters_changed(self, values: Mapping[str, Any]) -> None:
-        """Tell the viewers that watch these parameters."""
         for viewer in self.viewers:
             viewer.parameters_changed(values)
 
@@ -165,7 +164,6 @@ class Hub:
         return True
 
     def unsubscribe(self, viewer: Subscriber, channel_id: int) -> None:
-        """End one subscription of a viewer."""
         offer = self._offers.get(channel_id)
         if offer is not None:
             self._leave(viewer, offer)

@@ -84,7 +84,6 @@ class LiveSource(ViewerSource):
         return f"<LiveSource {self._realm}, {len(self._shown)} robots>"
 
     def start(self) -> None:
-        """Begin to watch for robots."""
         self._handles = [
             watch_robots(self._bus, self._realm, self._robots, self._on_gateway),
             self._bus.subscribe(f"{self._realm}/*/{topics.DEVICES.path}", self._on_devices, history=True),
@@ -140,7 +139,6 @@ class LiveSource(ViewerSource):
                 self._found(shown, topics.SENSOR(device.name).path)
 
     def _on_control(self, sample: Sample) -> None:
-        """Warn of a robot that is latched."""
         split = split_key(sample.key)
         if split is None or split[1] not in self._shown:
             return

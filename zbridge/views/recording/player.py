@@ -46,7 +46,6 @@ class PlaybackClock:
         return not self.playing and self._at_ns >= self.end_ns
 
     def now_ns(self, now: float) -> int:
-        """Return the time of the recording."""
         if not self.playing:
             return self._at_ns
         return min(self.end_ns, self._at_ns + int((now - self._since) * self.speed * 1e9))

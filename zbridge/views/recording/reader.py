@@ -121,7 +121,6 @@ class RecordingReader:
                 self._read_record(opcode, memoryview(content))
 
     def _inner(self, data: bytes) -> Iterator[RecordedMessage]:
-        """Yield the messages of a chunk."""
         view, at, end = memoryview(data), 0, len(data)
         while at < end:
             if end - at < _HEAD.size:
@@ -186,13 +185,11 @@ class Fields:
         return f"<Fields {self._at} of {len(self._content)}>"
 
     def number(self, form: str) -> int:
-        """Read a number of this struct form."""
         size = struct.calcsize(form)
         value: int = struct.unpack(form, self.octets(size))[0]
         return value
 
     def octets(self, size: int) -> memoryview:
-        """Read so many bytes."""
         if size > len(self._content) - self._at:
             raise BrokenError(f"a field of {size} bytes in a record that has {len(self._content) - self._at} more")
         self._at += size

@@ -70,12 +70,10 @@ class Summary(msgspec.Struct):
 
     @property
     def duration_s(self) -> float:
-        """Seconds from the first message to the last."""
         return (self.end_ns - self.begin_ns) / 1e9
 
     @property
     def robots(self) -> list[str]:
-        """The robots whose keys it has."""
         return robots_of(key.topic for key in self.keys)
 
 

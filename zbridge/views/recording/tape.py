@@ -133,7 +133,6 @@ class Tape:
 
     @property
     def bytes_written(self) -> int:
-        """Bytes of all files so far."""
         return self.bytes_before + (self._file.written if self._file is not None else 0)
 
     def begin(self, now: float, metadata: Mapping[str, Mapping[str, str]]) -> None:

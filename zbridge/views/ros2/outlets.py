@@ -30,7 +30,6 @@ class RosSide:
         return f"<RosSide domain {self.domain}, {self.types.distro}>"
 
     def node(self, namespace: str, name: str) -> Node:
-        """Name a node of this session."""
         return Node(self.domain, self.bus.zid, next(self._numbers), namespace, name)
 
     def endpoint(self, node: Node, kind: Kind, name: str, type_name: str, qos: RosQoS) -> Endpoint:

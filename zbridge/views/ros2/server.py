@@ -72,7 +72,6 @@ class View:
         return f"<View of {sorted(self.nodes)}>"
 
     def start(self) -> None:
-        """Begin to look for robots."""
         watch_robots(self._fleet, self._plan.realm, self._plan.robots, self._on_gateway)
         self._side.bus.watch_connected(self._on_connected)
 

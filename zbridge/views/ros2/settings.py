@@ -66,7 +66,6 @@ class Ros2Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     robot: dict[str, RobotBody] = {}
 
     def body(self, robot: str) -> RobotBody:
-        """Return what is known of a robot."""
         return self.robot.get(robot, self.others)
 
 

@@ -66,7 +66,6 @@ class Frames:
         return f"<Frames of {self.prefix}>"
 
     def sensor(self, name: str) -> str:
-        """Name the frame of a sensor."""
         return f"{self.prefix}/{ros_name(name)}"
 
 

@@ -44,9 +44,6 @@ class Latest:
         self._shot: Shot | None = None
         self._came = asyncio.Event()
 
-    def __repr__(self) -> str:
-        return f"<Latest {self._number}>"
-
     def show(self, stream: MjpegReader, part: MjpegPart) -> None:
         self._number += 1
         self._shot = Shot(self._number, stream, part)

@@ -114,9 +114,6 @@ class FoxglovePictures:
         self._state: tuple[str, str | None] | None = None
         self._news = RefusalNews(lambda _: True)
 
-    def __repr__(self) -> str:
-        return f"<FoxglovePictures {self.robot}>"
-
     def draw(
         self, topic: Topic, message: FleetMessage, now_ns: int, wanted: Container[str] | None = None
     ) -> list[Picture]:

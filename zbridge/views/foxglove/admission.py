@@ -63,9 +63,6 @@ class ViewerAdmission:
         self.policy = policy
         self._arrivals = Arrivals(ACCEPT_HZ)
 
-    def __repr__(self) -> str:
-        return f"<ViewerAdmission {self._arrivals!r}>"
-
     def refusal(self, host: str, connections: int, now: float) -> str | None:
         """Return why a connection is closed before it sends anything, as one word; None if it may continue."""
         if self.policy.networks and not is_among(host, self.policy.networks):

@@ -131,9 +131,6 @@ class Pictures:
         self._make = FoxglovePictures
         self._robots: dict[str, FoxglovePictures] = {}
 
-    def __repr__(self) -> str:
-        return f"<Pictures of {len(self._robots)} robots>"
-
     def draw(self, key: str, topic: Topic, payload: bytes, now_ns: int) -> Iterator[tuple[ChannelKind, int, bytes]]:
         """Yield the pictures of a message: channel, publish time, payload."""
         split = split_key(key)

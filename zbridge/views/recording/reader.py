@@ -181,9 +181,6 @@ class Fields:
         self._content = content
         self._at = 0
 
-    def __repr__(self) -> str:
-        return f"<Fields {self._at} of {len(self._content)}>"
-
     def number(self, form: str) -> int:
         size = struct.calcsize(form)
         value: int = struct.unpack(form, self.octets(size))[0]

@@ -26,9 +26,6 @@ class RosSide:
         self.sent = metrics.count("ros2_sent")
         self.not_encoded = metrics.count("ros2_not_encoded")
 
-    def __repr__(self) -> str:
-        return f"<RosSide domain {self.domain}, {self.types.distro}>"
-
     def node(self, namespace: str, name: str) -> Node:
         return Node(self.domain, self.bus.zid, next(self._numbers), namespace, name)
 
@@ -50,9 +47,6 @@ class Outlet:
         on_listened = partial(listened, self)
         self._publisher = side.bus.frames(endpoint.key, on_listened, best_effort=best_effort, kept=kept)
         self._handles: tuple[Handle, ...] = (side.bus.announce(endpoint.token()), self._publisher)
-
-    def __repr__(self) -> str:
-        return f"<Outlet {self._publisher.key}>"
 
     def put(self, message: Any) -> None:
         """Publish a message, or one that is CDR already; what ROS's types cannot hold is counted and left out."""

@@ -133,9 +133,6 @@ class RosPictures:
         self._positions: dict[str, float] = {}
         self._names: dict[str, str] = {}
 
-    def __repr__(self) -> str:
-        return f"<RosPictures {self.robot}>"
-
     def sensors(self, devices: tuple[Device, ...]) -> list[RosTopic]:
         """Return the topics of a robot's sensors; names that are one in ROS have one topic."""
         found: dict[str, RosTopic] = {}

@@ -62,9 +62,6 @@ class Frames:
         self.camera, self.laser = f"{prefix}/camera", f"{prefix}/laser"
         self.base = f"{prefix}/base_link"
 
-    def __repr__(self) -> str:
-        return f"<Frames of {self.prefix}>"
-
     def sensor(self, name: str) -> str:
         return f"{self.prefix}/{ros_name(name)}"
 
@@ -100,9 +97,6 @@ class MessageTemplate:
         marked = ((*zeros[:number], _MARK, *zeros[number + 1 :]) for number in range(count))
         self._places = [self._place(write(0, *numbers)) for numbers in marked]
 
-    def __repr__(self) -> str:
-        return f"<MessageTemplate of {len(self._plain)} bytes, numbers at {self._places}>"
-
     def fill(self, stamp_ns: int, numbers: tuple[float, ...]) -> bytes:
         data = bytearray(self._plain)
         _STAMP.pack_into(data, self._stamp_at, *divmod(stamp_ns, _SECOND_NS))
@@ -131,9 +125,6 @@ class Shapes:
         name = frames.laser.encode() + b"\0"
         self._laser = len(name), name
         self._before_ranges = struct.Struct(f"<4siII{len(name)}s{-len(name) % 4}x7fI")
-
-    def __repr__(self) -> str:
-        return f"<Shapes of {self.frames.prefix}>"
 
     def _fill(self, form: _Form, stamp_ns: int, *numbers: float) -> bytes:
         template = self._templates.get(form)

@@ -33,11 +33,24 @@ def _state_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(STATE / str(next(_numbers))))
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     for item in items:
         path = item.path.relative_to(item.config.rootpath).as_posix()
         if any(fnmatch(path, pattern) for pattern in REAL):
             item.add_marker("e2e")
+    if hasattr(config, "workerinput"):
+        items[:] = spread(items)
+
+
+def spread(items: list[pytest.Item]) -> list[pytest.Item]:
+    """Put the modules that mostly wait evenly among those that compute: each worker of xdist gets a run of the list."""
+    placed = []
+    for waits in (False, True):
+        alike = [item for item in items if (item.get_closest_marker("e2e") is not None) is waits]
+        modules = [list(module) for _, module in itertools.groupby(alike, key=lambda item: item.path)]
+        before = itertools.accumulate((len(module) for module in modules), initial=0)
+        placed += [(at / len(alike), module) for at, module in zip(before, modules, strict=False)]
+    return [item for _, module in sorted(placed, key=lambda one: one[0]) for item in module]
 
 
 def pytest_asyncio_loop_factories(item: pytest.Item) -> dict[str, Callable[[], asyncio.AbstractEventLoop]]:

@@ -29,6 +29,11 @@ from zbridge.robot.commands import Commands
 LEASE_S, DEADMAN_S = 3.0, 2.0
 
 
+def raw_ms() -> float:
+    """Return the time of the loop: a busy machine must not make commands older than the loop knows."""
+    return asyncio.get_running_loop().time() * 1000
+
+
 class Machine(Robot):
     """A robot that takes every command and keeps it; ``refusal`` and ``unstoppable`` say why not, ``left_out`` what."""
 
@@ -90,6 +95,7 @@ class Gateway:
             pump=lambda: None,
             clock=self._loop.time,
             clock_ns=time.time_ns,
+            raw_ms=raw_ms,
         )
         standstill = Standstill(context, self.authority, idle_stop_s=0.0)
         self.enforcer = Enforcer(context, self.authority, standstill, Audit(name, lambda line: None))
@@ -149,9 +155,9 @@ class World:
         self.gateways = {name: Gateway(self.bus, name) for name in names or ("r1",)}
         self.gateway = next(iter(self.gateways.values()))
         self.machine = self.gateway.machine
-        self.fleet = Fleet(self.bus.join("mine"))
+        self.fleet = Fleet(self.bus.join("mine"), clock_ms=raw_ms)
         self.robot = self.fleet[self.gateway.name]
-        self.others = Fleet(self.bus.join("others"))[self.gateway.name]
+        self.others = Fleet(self.bus.join("others"), clock_ms=raw_ms)[self.gateway.name]
         for gateway in self.gateways.values():
             if served:
                 gateway.serve()

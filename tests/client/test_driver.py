@@ -18,7 +18,7 @@ import msgpack
 import pytest
 
 import tests.client
-from tests.client import LEASE_S, numbered_tokens, settle, subscriptions, tokens
+from tests.client import LEASE_S, numbered_tokens, raw_ms, settle, subscriptions, tokens
 from tests.proofs import lease
 from zbridge.bus import Answer, Handle, Publisher, Sample
 from zbridge.bus.fake import FakeBus
@@ -187,7 +187,7 @@ async def test_with_a_certificate_a_program_asks_in_its_name_and_in_no_other(
     wishes: dict[str, Any], said: str, asked: str
 ) -> None:
     world = World()
-    robot = Fleet(world.bus, name="op1")["r1"]
+    robot = Fleet(world.bus, name="op1", clock_ms=raw_ms)["r1"]
     if not asked:
         with pytest.raises(Malformed) as raised:
             await robot.control(**wishes).__aenter__()
@@ -347,7 +347,7 @@ class SlowBus(FakeBus):
 async def test_no_command_overtakes_another_however_they_are_given_and_all_keys_are_given_up() -> None:
     world = World()
     bus = SlowBus(world)
-    async with Fleet(bus)["r1"].control(ME) as drive:
+    async with Fleet(bus, clock_ms=raw_ms)["r1"].control(ME) as drive:
         await drive.mode("manual")
         await drive(forward=0.5)
         await asyncio.gather(
@@ -606,7 +606,7 @@ async def test_a_program_cancelled_while_it_drives_and_while_it_gives_the_lease_
     world = World()
 
     async def program() -> None:
-        async with Fleet(SlowBus(world))["r1"].control(ME) as drive:
+        async with Fleet(SlowBus(world), clock_ms=raw_ms)["r1"].control(ME) as drive:
             await drive.during(100.0, forward=0.5)
 
     task = asyncio.create_task(program())

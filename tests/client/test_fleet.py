@@ -55,6 +55,14 @@ class World(tests.client.World):
         return [sample for sample in self.bus._shared.history if sample.key == f"fleet/r1/{path}"]
 
 
+async def test_a_robot_has_a_feed_of_every_message_that_is_published() -> None:
+    robot = World("r1").fleet["r1"]
+    declared = [topic for topic in vars(topics).values() if isinstance(topic, Topic)]
+    published = [topic.path for topic in declared if not topic.path.startswith("@")]
+    assert len(published) >= 13
+    assert [path for path in published if not hasattr(robot, path)] == []
+
+
 async def test_robots_lists_what_has_a_gateway_or_a_status_in_its_own_realm() -> None:
     world = World("r2", "r1", "r3")
     world.gateways["r3"].put(topics.STATUS, b"\xc1")

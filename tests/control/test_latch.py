@@ -138,6 +138,20 @@ def test_the_answer_to_others_has_the_ids_of_the_fleet_and_its_last_releases() -
     assert told.released == tuple(stop_id(number) for number in range(103, 100 + RELEASED + 3))
 
 
+def test_what_another_gateway_of_the_robot_released_is_released_here_and_stays_so() -> None:
+    away, meanwhile = Latches(), Latches()
+    for latches in (away, meanwhile):
+        latches.add(latch(1))
+        latches.add(latch(2, fleet=True))
+        latches.add(latch(3))
+    meanwhile.release(stop_id(1), fleet=False)
+    meanwhile.release(stop_id(2), fleet=True)
+    assert away.merge(meanwhile.record) == ()
+    assert away.in_force == (latch(3),)
+    assert not away.add(latch(1)), "released for good"
+    assert not away.add(latch(2, fleet=True))
+
+
 def test_everything_is_handed_to_another_process() -> None:
     one, other = Latches(), Latches()
     one.add(latch(1))
@@ -184,6 +198,18 @@ def test_a_latched_robot_is_stopped_and_nobody_gets_its_lease_until_the_last_id_
     assert not authority.acquire(Acquire(who="bob"), 2.0).ok
     authority.unlatch(stop_id(2), "op1", fleet=False)
     assert authority.state == "stopped"
+    assert authority.acquire(Acquire(who="bob"), 3.0).ok
+
+
+def test_what_another_gateway_released_frees_the_robot_with_the_last_id() -> None:
+    authority = Authority(3.0, 2.0, numbered())
+    latched(authority)
+    latched(authority, 2)
+    authority.merge(LatchRecord(released=(stop_id(1),)))
+    assert authority.state == "latched"
+    authority.merge(LatchRecord(released=(stop_id(1), stop_id(2))))
+    assert authority.state == "stopped"
+    assert [event.what for event in authority.events()][-2:] == [EventKind.UNLATCHED, EventKind.UNLATCHED]
     assert authority.acquire(Acquire(who="bob"), 3.0).ok
 
 

@@ -111,7 +111,7 @@ async def test_nothing_is_connected_while_another_process_may_get_the_link_also_
 async def test_a_robot_is_healthy_while_it_is_established_and_was_heard_of(rig: Rig) -> None:
     rig.sends(POSITION)
     standing = rig.device.standing
-    assert (standing.healthy, standing.latches) == (True, ())
+    assert (standing.healthy, standing.record.latches) == (True, ())
     assert standing.connected_s == pytest.approx(1.15, abs=0.01)
     await asyncio.sleep(HEARD_S - 0.1)
     assert rig.device.standing.healthy
@@ -136,7 +136,7 @@ async def test_latched_stops_of_the_other_gateway_are_in_force_from_the_first_mo
     rig.device.merge(LatchRecord((Latch(b"\x07" * 16, "ann", "wet floor"),)))
     await rig.device.step_in()
     assert rig.control["state"] == "latched"
-    assert [latch.who for latch in rig.device.standing.latches] == ["ann"]
+    assert [latch.who for latch in rig.device.standing.record.latches] == ["ann"]
 
 
 async def test_nobody_else_stops_the_robot_if_this_process_dies_meanwhile(rig: Rig) -> None:

@@ -140,7 +140,7 @@ async def test_another_gateway_says_so_the_robot_is_stopped_at_once_unless_it_is
                 await rig.play("left > left")
             rig.device.merge(LatchRecord(autonomous=True))
             assert disk.record == LatchRecord(autonomous=True)
-            assert rig.device.standing.autonomous
+            assert rig.device.standing.record.autonomous
             await asyncio.sleep(0.05)
             assert (rig.written() == []) is driven
             rig.command("stop")

@@ -155,18 +155,17 @@ class Robot:
 
     healthy: bool = True
     connected_at: float | None = 0.0
-    latches: tuple[Latch, ...] = ()
+    record: LatchRecord = field(default_factory=LatchRecord)
     rivals: list[set[str]] = field(default_factory=list)
     heard_latches: set[Latch] = field(default_factory=set)
     merged: list[LatchRecord] = field(default_factory=list)
-    autonomous: bool = False
     turns: list[str] = field(default_factory=list)
 
     @property
     def standing(self) -> Standing:
         now = asyncio.get_running_loop().time()
         age_s = now - self.connected_at if self.must_stay else 0.0
-        return Standing(self.healthy, age_s, self.latches, self.autonomous)
+        return Standing(self.healthy, age_s, self.record)
 
     @property
     def must_stay(self) -> bool:
@@ -476,7 +475,7 @@ async def test_whoever_answers_better_claims_silences_a_gateway_for_as_long_as_i
     assert (robot.turns, await bus.alive(TOKEN), watching.done()) == (["aside", "in"], [TOKEN], False)
 
 
-async def test_a_waiting_gateway_hears_of_the_latched_stops_of_the_one_that_serves() -> None:
+async def test_a_waiting_gateway_hears_of_the_latches_and_releases_of_the_one_that_serves() -> None:
     bus, mirrored = FakeBus("5"), list[LatchRecord]()
     latch = Latch(b"a" * 16, "ann", "a cable is loose", fleet=True)
     first = await owned(bus)
@@ -484,9 +483,9 @@ async def test_a_waiting_gateway_hears_of_the_latched_stops_of_the_one_that_serv
     taking = asyncio.create_task(Ownership(bus.join("1"), KEYS, mirror=mirrored.append).take())
     await asyncio.sleep(1.0)
     assert {*mirrored} == {LatchRecord()}
-    robot.latches, robot.autonomous = (latch,), True
+    robot.record = LatchRecord((latch,), (b"b" * 16,), (b"c" * 16,), autonomous=True)
     await asyncio.sleep(1.0)
-    assert mirrored[-1] == LatchRecord((latch,), autonomous=True)
+    assert mirrored[-1] == robot.record
     assert not taking.done()
 
 
@@ -552,9 +551,9 @@ def test_the_table_of_the_documentation_is_the_one_that_is_executed() -> None:
 async def test_a_latched_stop_of_the_one_that_leaves_is_heard_by_the_one_that_stays(*, noticed: bool) -> None:
     latch = Latch(b"\x07" * 16, "ann")
     for first, second, winner in [
-        (Robot(True, 0.0), Robot(False, None, (latch,)), 0),
-        (Robot(False, None, (latch,)), Robot(True, 0.0), 1),
-        (Robot(True, 0.0), Robot(True, 5.0, (latch,)), 0),
+        (Robot(True, 0.0), Robot(False, None, LatchRecord((latch,))), 0),
+        (Robot(False, None, LatchRecord((latch,))), Robot(True, 0.0), 1),
+        (Robot(True, 0.0), Robot(True, 5.0, LatchRecord((latch,))), 0),
     ]:
         two = Two()
         await two.serve(first, second)

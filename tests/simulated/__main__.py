@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import itertools
 import json
 import sys
@@ -58,6 +59,7 @@ def campaign(options: Any, counts: Counter[str]) -> int:
     """Run one scenario after the other. counts: is added what they reached."""
     begun, simulated, failed = time.process_time(), 0.0, 0
     ran = 0
+    gc.freeze()  # what is loaded stays: only the scenarios' own objects are looked at after each
     for seed in itertools.count(options.seed):
         if time.process_time() - begun > options.seconds or ran == options.count:
             break

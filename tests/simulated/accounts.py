@@ -113,8 +113,8 @@ class Grant:
                 self.held_back = False
             self.last_motion, self.autonomous = None, False
             return
-        if command.dated and late_s > min(MAX_AGE_S, self.deadman_s) - 0.05:
-            return  # refused as stale, or nearly: it begins nothing
+        if command.dated and late_s > min(MAX_AGE_S, self.deadman_s) + 0.05:
+            return  # refused as stale for certain: it begins nothing
         last = self.last_motion
         if last is not None:
             since_s = now - (last.given_at if last.dated else last.received[self.gateway])

@@ -299,8 +299,15 @@ MUTANTS = (
         "claim without latches",
         "ownership",
         OWNERSHIP,
-        "            latches=standing.latches,",
-        "            latches=(),",
+        "            **msgspec.structs.asdict(standing.record),",
+        "",
+    ),
+    Mutant(
+        "claim without releases",
+        "situations",
+        "zbridge/control/latch.py",
+        "                self._in_force.pop(stop_id, None)\n        return",
+        "                pass\n        return",
     ),
     # latch
     Mutant("a latch is a plain stop", "latch", AUTHORITY, "        if stop.latch is True:", "        if False:"),
@@ -358,8 +365,8 @@ MUTANTS = (
         "a waiting gateway does not learn of mode 3",
         "situations",
         OWNERSHIP,
-        "        return LatchRecord(self.latches, autonomous=self.autonomous)",
-        "        return LatchRecord(self.latches)",
+        "        return LatchRecord(self.latches, self.released, self.released_fleet, self.autonomous)",
+        "        return LatchRecord(self.latches, self.released, self.released_fleet)",
     ),
     Mutant(
         "what was written down of mode 3 stops nobody",

@@ -238,6 +238,19 @@ def _locked_up(rng: random.Random, made: Made) -> None:
     made["steps"] += [_drive(t + s, "op1") for s in (30.0, 38.0)]
 
 
+def _released_meanwhile(rng: random.Random, made: Made) -> None:
+    """A latched stop is released while one gateway of the robot is away; later that one serves the robot."""
+    _second_gateway(made)
+    t = rng.uniform(8.0, 10.0)
+    made["steps"] = [
+        {"t": 3.5, "who": "op1", "do": "latch"},
+        _fault(5.0, rng.choice(("kill", "end")), target="gw1", **{"for": rng.uniform(2.0, 8.0)}),
+        {"t": t, "who": "op1", "do": "unlatch"},
+        _fault(t + 8.0, rng.choice(("kill", "end")), target="gw2", **{"for": 8.0}),
+        _drive(t + 14.0, "op1"),
+    ]
+
+
 def _killed_driver(rng: random.Random, made: Made) -> None:
     """The driver's process is killed while it drives, or its bus is lost, or it is frozen."""
     kind = rng.choice(("kill", "pause", "unlink"))
@@ -273,6 +286,7 @@ SITUATIONS: tuple[Callable[[random.Random, Made], None], ...] = (
     _failed_restarts,
     _locked_up,
     _locked_up,
+    _released_meanwhile,
     _killed_driver,
     _forged_and_flooded,
 )

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from functools import lru_cache
 from typing import TypeVar
 
 import msgspec
@@ -19,6 +20,7 @@ from zbridge.metrics import Metrics
 H = TypeVar("H", bound=Handle)
 
 
+@lru_cache(maxsize=65536)
 def meet(one: str, other: str) -> bool:
     """Tell whether there is a key that both key expressions match."""
     return _meet(one.split("/"), other.split("/"))

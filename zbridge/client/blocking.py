@@ -25,6 +25,7 @@ from zbridge.client import fleet as fleets
 from zbridge.client.stops import Outcome
 from zbridge.errors import BusError, LeaseLost
 from zbridge.fleet.messages import (
+    Battery,
     Control,
     Devices,
     FleetMessage,
@@ -199,6 +200,7 @@ class Robot:
         self.pose: Feed[Pose] = Feed(loop, robot.pose)
         self.text: Feed[Text] = Feed(loop, robot.text)
         self.image: Feed[Image] = Feed(loop, robot.image)
+        self.battery: Feed[Battery] = Feed(loop, robot.battery)
         self.status: StateFeed[Status] = StateFeed(loop, robot.status)
         self.scanner: StateFeed[Scanner] = StateFeed(loop, robot.scanner)
         self.map: StateFeed[Map] = StateFeed(loop, robot.map)

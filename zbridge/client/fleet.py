@@ -19,6 +19,7 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import (
     Acquire,
+    Battery,
     Control,
     Devices,
     FleetMessage,
@@ -209,7 +210,7 @@ class ControlFeed(StateFeed[Control]):
         takeover: take the robot from its holder. wait_s: longest wait for the robot's gateway, seconds.
         Raises Held with the holder's name, BusError if nobody answers or the role lacks, or Refused as the gateway did.
         """
-        who, name = _names(who, name, self._own)
+        who, name = _lease_identity(who, name, self._own)
         request = Acquire(
             who=who,
             priority=priority,
@@ -227,16 +228,23 @@ class ControlFeed(StateFeed[Control]):
             await asyncio.shield(driver.release())
 
 
-def _names(who: str | None, name: str | None, own: str | None) -> tuple[str, str]:
-    """Return as whom the lease is asked for, and the name in the key; own: the name in the certificate, if any."""
-    if own is None:
+def _lease_identity(who: str | None, name: str | None, certified: str | None) -> tuple[str, str]:
+    """Return the name that people are shown, and the one in the keys of the lease.
+
+    certified: the name in the certificate, if there is one. Raises Malformed if it does not allow the others.
+    """
+    if certified is None:
         who = who or default_who()
         return who, name or who
-    who = who or own
-    if name not in (None, own) or not topics.speaks_for(who, escape(own)):
-        wrong = f"name = {name!r}" if name not in (None, own) else f"who = {who!r}"
-        raise Malformed(f"{wrong}: the certificate of this program says {own!r}: expected that, or {f'{own}.suffix'!r}")
-    return who, own
+    who, wrong = who or certified, ""
+    if name not in (None, certified):
+        wrong = f"name = {name!r}"
+    elif not topics.speaks_for(who, escape(certified)):
+        wrong = f"who = {who!r}"
+    if wrong:
+        expected = f"expected that, or {f'{certified}.suffix'!r}"
+        raise Malformed(f"{wrong}: the certificate of this program says {certified!r}: {expected}")
+    return who, certified
 
 
 class Robot:
@@ -261,6 +269,7 @@ class Robot:
         self.pose: Feed[Pose] = self._feed(topics.POSE)
         self.text: Feed[Text] = self._feed(topics.TEXT)
         self.image: Feed[Image] = self._feed(topics.IMAGE)
+        self.battery: Feed[Battery] = self._feed(topics.BATTERY)
         self.status: StateFeed[Status] = StateFeed(bus, keys, topics.STATUS)
         self.scanner: StateFeed[Scanner] = StateFeed(bus, keys, topics.SCANNER)
         self.map: StateFeed[Map] = StateFeed(bus, keys, topics.MAP)

@@ -11,7 +11,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Awaitable, Callable, Iterable
+from typing import TypeVar
 
 import msgspec
 
@@ -36,6 +37,8 @@ _APART_S = 0.1
 """Seconds after which a repeated stop is no repetition for a gateway."""
 _WHO, _REASON = 64, 100
 """Characters that fit the bound of a stop, with room for others than ASCII."""
+
+T = TypeVar("T")
 
 Outcome = Refused | BusError | None
 """What came of a robot: None if it was confirmed."""
@@ -85,20 +88,9 @@ async def stop_robot(bus: Bus, keys: KeySpace, stop: Stop) -> None:
         raise NotReady(f"{keys.robot}: stop taken, but the robot is {status.state}: {why}")
 
 
-async def stop_robots(bus: Bus, realm: str, names: Iterable[str], stop: Stop) -> dict[str, Outcome]:
+async def stop_robots(bus: Bus, realm: str, robots: Iterable[str], stop: Stop) -> dict[str, Outcome]:
     """Stop robots, so many at a time; return for each what came of it."""
-    room = asyncio.Semaphore(AT_ONCE)
-
-    async def one(name: str) -> Outcome:
-        async with room:
-            try:
-                await stop_robot(bus, KeySpace(realm, name), stop)
-            except (Refused, BusError) as error:
-                return error
-            return None
-
-    names = sorted(set(names))
-    return dict(zip(names, await asyncio.gather(*map(one, names)), strict=True))
+    return await _each(robots, lambda robot: stop_robot(bus, KeySpace(realm, robot), stop))
 
 
 async def unlatch_robot(bus: Bus, keys: KeySpace, name: str) -> tuple[Latch, ...]:
@@ -114,28 +106,38 @@ async def unlatch_robot(bus: Bus, keys: KeySpace, name: str) -> tuple[Latch, ...
     return own
 
 
-async def unlatch_fleet(bus: Bus, realm: str, names: Iterable[str], name: str) -> dict[str, Outcome]:
-    """Release the latched stops of the whole fleet at these robots, as ``name``; return for each what came of it.
+async def unlatch_fleet(bus: Bus, realm: str, robots: Iterable[str], who: str) -> dict[str, Outcome]:
+    """Release the latched stops of the whole fleet at these robots, as ``who``; return for each what came of it.
 
-    A robot that was not reached by a stop of all may have been sent it by its own name: that is released, too. Robots
-    that do not know a released id are sent it, for they may learn of the stop later.
+    Where ``stop --all`` reached a robot only by its own key, the robot holds the id as its own latch: that is released,
+    too. Robots that do not know a released id are sent it, for they may learn of the stop later.
     """
-    names, latches = sorted(names), dict[str, tuple[Latch, ...]]()
-    outcomes = dict[str, Outcome].fromkeys(names)
-    for robot in names:
-        try:
-            latches[robot] = await _latches(bus, KeySpace(realm, robot))
-        except BusError as error:
-            outcomes[robot] = error
-    ids = {latch.id for known in latches.values() for latch in known if latch.fleet}
-    for robot, known in latches.items():
-        alone = {latch.id for latch in known if not latch.fleet}
-        try:
-            for stop_id in sorted(ids):
-                await _release(bus, KeySpace(realm, robot), name, stop_id, fleet=stop_id not in alone)
-        except (Refused, BusError) as error:
-            outcomes[robot] = error
-    return outcomes
+    latches = await _each(robots, lambda robot: _latches(bus, KeySpace(realm, robot)))
+    known = {robot: answer for robot, answer in latches.items() if isinstance(answer, tuple)}
+    fleet_ids = sorted({latch.id for held in known.values() for latch in held if latch.fleet})
+
+    async def release(robot: str) -> None:
+        own_ids = {latch.id for latch in known[robot] if not latch.fleet}
+        for stop_id in fleet_ids:
+            await _release(bus, KeySpace(realm, robot), who, stop_id, fleet=stop_id not in own_ids)
+
+    errors = {robot: answer for robot, answer in latches.items() if not isinstance(answer, tuple)}
+    return errors | await _each(known, release)
+
+
+async def _each(robots: Iterable[str], ask: Callable[[str], Awaitable[T]]) -> dict[str, T | Refused | BusError]:
+    """Do it for each robot, so many at a time; return for each the result, or the error."""
+    room = asyncio.Semaphore(AT_ONCE)
+
+    async def one(robot: str) -> T | Refused | BusError:
+        async with room:
+            try:
+                return await ask(robot)
+            except (Refused, BusError) as error:
+                return error
+
+    names = sorted(set(robots))
+    return dict(zip(names, await asyncio.gather(*map(one, names)), strict=True))
 
 
 async def _latches(bus: Bus, keys: KeySpace) -> tuple[Latch, ...]:

@@ -224,7 +224,12 @@ class Authority:
 
     def merge(self, record: LatchRecord) -> None:
         """Take over what another gateway of this robot knows."""
+        before = self.latches.in_force
         self._latch(*self.latches.merge(record))
+        if any(latch.id not in self.latches for latch in before):
+            self._events.append(Event(EventKind.UNLATCHED, _ANOTHER_GATEWAY))
+        if before and not self.latches:
+            self._handle(Input.UNLATCH, Cause())
 
     def unlatch(self, stop_id: bytes, who: str, *, fleet: bool) -> None:
         """Release a latched stop; raise Refused. who: the name that asks. The robot may be acquired with the last."""
@@ -481,4 +486,5 @@ _MOTION, _NEUTRAL, _STALE_NEUTRAL = (
     Input.NEUTRAL,
     Input.STALE_NEUTRAL,
 )  # looking up a member of an enum costs more than a command may
+_ANOTHER_GATEWAY = "another gateway of the robot"
 _SHOWN = {State.MOVING: "held", State.HELD_BACK: "held"}

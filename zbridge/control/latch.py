@@ -159,15 +159,15 @@ class Latches:
             record = msgspec.convert(state, LatchRecord)
         except msgspec.ValidationError as error:
             raise ProtocolError(f"latches: {error}") from error
+        self.merge(record)
+
+    def merge(self, record: LatchRecord) -> tuple[Latch, ...]:
+        """Take over what another gateway of this robot knows; return the latches that are new."""
+        self.autonomous = self.autonomous or record.autonomous
         for known, released in ((self._released, record.released), (self._released_fleet, record.released_fleet)):
             known.extend(stop_id for stop_id in released if stop_id not in known)
             for stop_id in released:
                 self._in_force.pop(stop_id, None)
-        self.merge(record)
-
-    def merge(self, record: LatchRecord) -> tuple[Latch, ...]:
-        """Take over what another gateway of this robot knows to be in force; return the latches that are new."""
-        self.autonomous = self.autonomous or record.autonomous
         return tuple(latch for latch in record.latches if self.add(latch))
 
 

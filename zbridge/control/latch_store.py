@@ -91,7 +91,7 @@ class LatchStore:
     def mirror(self, record: LatchRecord) -> None:
         """Write what the gateway that owns the robot says, on a thread."""
         autonomous = record.autonomous or self._written.get(self._standby, LatchRecord()).autonomous
-        self._put(self._standby, LatchRecord(record.latches, autonomous=autonomous))
+        self._put(self._standby, msgspec.structs.replace(record, autonomous=autonomous))
 
     async def flush(self) -> None:
         """Wait until everything is written, or could not be, for at most :data:`FLUSH_S`."""

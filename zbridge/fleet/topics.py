@@ -218,15 +218,7 @@ RPC_UNLATCH_FLEET = _family("@rpc/control/unlatch_fleet", Unlatch, Delivery.QUER
 RPC_LATCH = Topic("@rpc/latch", Query, Delivery.QUERY, SMALL_BYTES)
 RPC_REFUSED = _family("@rpc/control/refused", Refusals, Delivery.QUERY, SETTING_BYTES)
 
-_TOPICS = {
-    topic.path: topic
-    for topic in (
-        *(SCAN, MOTION, POSE, TEXT, IMAGE, BATTERY),
-        *(STATUS, CONTROL, SCANNER, MAP, LIDAR, CAMERA, DEVICES),
-        *(CMD_DRIVE, CMD_STOP, CMD_MODE, CMD_LIGHT, CMD_LIDAR, CMD_CAMERA, CMD_TEXT, CMD_SCAN),
-        *(RPC_MAP, RPC_POSE, RPC_RENEW, RPC_RELEASE, RPC_LATCH),
-    )
-}
+_TOPICS = {topic.path: topic for topic in list(globals().values()) if isinstance(topic, Topic)}
 _FAMILIES = {
     "sensor": SENSOR,
     "raw": RAW,
@@ -307,7 +299,7 @@ def split_key(key: str) -> tuple[str, str, str] | None:
     return (realm, robot, path) if path else None
 
 
-@lru_cache(maxsize=4096)
+@lru_cache(maxsize=65536)
 def matches(key_expr: str, key: str) -> bool:
     """Tell whether a key expression matches a key, as on the bus: ``@...`` matches only itself."""
     return _follow(tuple(key_expr.split("/")), tuple(key.split("/")))

@@ -7,7 +7,7 @@ socket.
 
 **A crash.** The stop is written before anything else. Then a process is forked that takes over what the dead one
 deposited, and so keeps the robot's connection; it may read and write when the stop was written often enough. Where that
-is not possible, or the third in a row has crashed, the connection is closed, and the next process starts after a time
+is not possible, or the fourth in a row has crashed, the connection is closed, and the next process starts after a time
 that :class:`RestartDelay` gives.
 
 **A restart.** The process asks for a successor, and hands everything over to it. It reports this

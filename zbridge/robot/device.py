@@ -296,12 +296,12 @@ class Device:
     def standing(self) -> Standing:
         """How this gateway stands with the robot."""
         session, talk = self._context.robot.driving, self._links.first.conversation
-        latches = self._enforcer.authority.latches
+        record = self._enforcer.authority.latches.record
         if talk is None or session is None:
-            return Standing(latches=latches.in_force, autonomous=latches.autonomous)
+            return Standing(record=record)
         established = session.state is State.ESTABLISHED and session.doubtful is None
         healthy = established and not talk.stalled and talk.unheard_s <= HEARD_S
-        return Standing(healthy, talk.connected_s, latches.in_force, latches.autonomous)
+        return Standing(healthy, talk.connected_s, record)
 
     @property
     def must_stay(self) -> bool:

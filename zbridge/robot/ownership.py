@@ -41,7 +41,7 @@ import msgspec
 from zbridge.bus import Bus, Handle, IncomingQuery
 from zbridge.control.latch import LatchRecord
 from zbridge.errors import BusError
-from zbridge.fleet.messages import Latch
+from zbridge.fleet.messages import Latch, StopId
 from zbridge.fleet.topics import KeySpace
 from zbridge.machine import step
 from zbridge.protocol.kept import Exported
@@ -79,20 +79,19 @@ class Standing(msgspec.Struct, frozen=True):
     """How a gateway stands with its robot.
 
     healthy: the robot is established, not in doubt, and was heard of a moment ago. connected_s: age of the connection,
-    0 where there is none. latches: the robot's latched stops. autonomous: it was told to move by itself.
+    0 where there is none. record: the robot's latched stops, and what else survives a restart.
     """
 
     healthy: bool = False
     connected_s: float = 0.0
-    latches: tuple[Latch, ...] = ()
-    autonomous: bool = False
+    record: LatchRecord = LatchRecord()
 
 
 class Claim(msgspec.Struct, frozen=True):
     """What a gateway claims. held_s: seconds since the robot is served, 0 while it is not.
 
-    healthy, connected_s, latches, autonomous: its :class:`Standing`. yielded: to a better claim. leaving: it ends in
-    good order.
+    healthy, connected_s: its :class:`Standing`; the fields after ``leaving`` are its record. yielded: to a better
+    claim. leaving: it ends in good order.
     """
 
     held_s: float = 0.0
@@ -101,12 +100,14 @@ class Claim(msgspec.Struct, frozen=True):
     yielded: bool = False
     leaving: bool = False
     latches: tuple[Latch, ...] = ()
+    released: tuple[StopId, ...] = ()
+    released_fleet: tuple[StopId, ...] = ()
     autonomous: bool = False
 
     @property
     def record(self) -> LatchRecord:
         """What other gateways of the robot write down."""
-        return LatchRecord(self.latches, autonomous=self.autonomous)
+        return LatchRecord(self.latches, self.released, self.released_fleet, self.autonomous)
 
     @property
     def plausible(self) -> bool:
@@ -459,8 +460,7 @@ class Ownership:
             connected_s=standing.connected_s,
             yielded=self._state is OwnershipState.YIELDED or self._waits,
             leaving=self._leaving,
-            latches=standing.latches,
-            autonomous=standing.autonomous,
+            **msgspec.structs.asdict(standing.record),
         )
 
     def _on_question(self, question: IncomingQuery) -> None:

@@ -107,7 +107,7 @@ class FoxglovePictures:
 
     def __init__(self, robot: str) -> None:
         self.robot = robot
-        self._map, self._base, self._scan = (f"{robot}/{frame}" for frame in ("map", "base", "scan"))
+        self._frame = {name: f"{robot}/{name}" for name in ("map", "base", "scan")}
         self._channels: dict[str, tuple[ViewerChannel, ...]] = {}
         self._trail: deque[tuple[float, float]] = deque(maxlen=TRAIL_POINTS)
         self._trail_drawn_ns = self._frames_sent_ns = -_END_NS
@@ -138,15 +138,15 @@ class FoxglovePictures:
             yield from also.draw(self, message, stamp_ns)
         elif (shape := _SHAPES.get(type(message))) is None:
             yield _ENCODE(message)
-        elif (payload := shape.write(message, f"{self.robot}/{shape.frame}", stamp_ns)) is not None:
+        elif (payload := shape.write(message, self._frame[shape.frame], stamp_ns)) is not None:
             yield payload
 
     def _frames(self, message: FleetMessage, stamp_ns: int) -> Iterator[bytes]:
         """Tell where the frames are: with every pose, and once a second where only scans come."""
-        scanner = (self._base, self._scan, None)
+        scanner = (self._frame["base"], self._frame["scan"], None)
         if isinstance(message, Pose) and _is_finite(message):
             self._frames_sent_ns = stamp_ns
-            yield transforms(((self._map, self._base, message), scanner), stamp_ns)
+            yield transforms(((self._frame["map"], self._frame["base"], message), scanner), stamp_ns)
         elif abs(stamp_ns - self._frames_sent_ns) >= FRAMES_EVERY_NS:
             self._frames_sent_ns = stamp_ns
             yield transforms((scanner,), stamp_ns)
@@ -160,7 +160,7 @@ class FoxglovePictures:
         self._trail.append(at)
         if abs(stamp_ns - self._trail_drawn_ns) >= TRAIL_EVERY_NS:
             self._trail_drawn_ns = stamp_ns
-            yield trail(self._trail, self._map, stamp_ns)
+            yield trail(self._trail, self._frame["map"], stamp_ns)
 
     def _logged(self, message: FleetMessage, stamp_ns: int) -> Iterator[bytes]:
         """Write texts, changes of the robot's state, and refusals that are new."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Mapping
+from functools import cache
 from typing import Any
 
 import msgspec
@@ -121,18 +122,14 @@ class Shapes:
         self._types = types
         self._make = types.nested
         self.frames = frames
-        self._templates: dict[_Form, MessageTemplate] = {}
+        self._template = cache(self._make_template)
         name = frames.laser.encode() + b"\0"
         self._laser = len(name), name
         self._before_ranges = struct.Struct(f"<4siII{len(name)}s{-len(name) % 4}x7fI")
 
-    def _fill(self, form: _Form, stamp_ns: int, *numbers: float) -> bytes:
-        template = self._templates.get(form)
-        if template is None:
-            types, frames = self._types, self.frames
-            write = lambda *values: types.encode(types.nested(*form(frames, *values)))  # noqa: E731
-            template = self._templates[form] = MessageTemplate(write, len(numbers))
-        return template.fill(stamp_ns, numbers)
+    def _make_template(self, form: _Form, count: int) -> MessageTemplate:
+        types, frames = self._types, self.frames
+        return MessageTemplate(lambda *values: types.encode(types.nested(*form(frames, *values))), count)
 
     def laser_scan(self, scan: Scan, scanner: Scanner | None, stamp_ns: int, period_s: float) -> bytes | None:
         """Write a LaserScan: as many ranges as its angles say, counter-clockwise. period_s: between two scans, or 0.
@@ -157,7 +154,7 @@ class Shapes:
 
     def pose_stamped(self, pose: Pose, stamp_ns: int) -> bytes | None:
         """Write a PoseStamped in the robot's map."""
-        return self._fill(_pose_stamped, stamp_ns, *_place(pose)) if _is_finite(pose) else None
+        return self._template(_pose_stamped, 4).fill(stamp_ns, _place(pose)) if _is_finite(pose) else None
 
     def odometry(self, pose: Pose | None, speeds: Speeds, stamp_ns: int, spread: float = 1.0) -> bytes | None:
         """Write an Odometry. pose: in the frame odom, None: unknown; spread: its variances are so many times larger."""
@@ -169,8 +166,8 @@ class Shapes:
         forward = UNMEASURED if speeds.forward_mps is None else SPEED_VARIANCE * speeds.full_mps**2
         turn = UNMEASURED if speeds.turn_radps is None else TURN_VARIANCE
         speed = speeds.forward_mps or 0.0, speeds.turn_radps or 0.0
-        place = _place(pose or _ORIGIN)
-        return self._fill(_odometry, stamp_ns, *place, position, position, heading, *speed, forward, turn)
+        numbers = (*_place(pose or _ORIGIN), position, position, heading, *speed, forward, turn)
+        return self._template(_odometry, 11).fill(stamp_ns, numbers)
 
     def occupancy_grid(self, fleet_map: Map, stamp_ns: int) -> Any | None:
         """Make an OccupancyGrid: -1 unknown, 0 free, 100 occupied; rows along y."""
@@ -194,7 +191,7 @@ class Shapes:
         if gyro is None and acceleration is None:
             return None
         known = tuple(0.0 if vector is not None else _NO_ESTIMATE for vector in (gyro, acceleration))
-        return self._fill(_imu, stamp_ns, *(gyro or _NOTHING), *(acceleration or _NOTHING), *known)
+        return self._template(_imu, 8).fill(stamp_ns, (*(gyro or _NOTHING), *(acceleration or _NOTHING), *known))
 
     def battery_state(self, battery: Battery, stamp_ns: int) -> Any | None:
         """Make a BatteryState; NaN is what the robot does not tell."""
@@ -243,7 +240,7 @@ class Shapes:
 
     def moved(self, pose: Pose, stamp_ns: int) -> bytes | None:
         """Write the TFMessage of where the robot is."""
-        return self._fill(_moved, stamp_ns, *_place(pose)) if _is_finite(pose) else None
+        return self._template(_moved, 4).fill(stamp_ns, _place(pose)) if _is_finite(pose) else None
 
 
 def urdf(robot: str, frames: Frames, body: RobotBody) -> str:

@@ -73,8 +73,10 @@ def expressions(statement: ast.stmt) -> Iterator[ast.AST]:
 
 
 def mutations(statement: ast.stmt) -> list[tuple[str, Callable[[], ast.stmt | None]]]:
-    """Return (kind, action) of every mutation of one statement; an action returns what replaces the statement,
-    or None if it changed the statement in place."""
+    """Return (kind, action) of every mutation of one statement.
+
+    An action returns what replaces the statement, or None if it changed the statement in place.
+    """
     found: list[tuple[str, Callable[[], ast.stmt | None]]] = []
     text = ast.unparse(statement)
     if isinstance(statement, ast.Expr):

@@ -11,6 +11,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
 
 ROOT = Path(__file__).parents[1]
 CONTRACTS = [
@@ -55,7 +56,9 @@ OFFENCES = {
 
 
 def lint(root: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-c", LINT, "--no-cache"], cwd=root, capture_output=True, text=True)
+    return subprocess.run(
+        [sys.executable, "-c", LINT, "--no-cache"], cwd=root, capture_output=True, text=True, check=False
+    )
 
 
 def broken(ran: subprocess.CompletedProcess[str]) -> list[str]:
@@ -78,6 +81,14 @@ def test_every_contract_is_kept() -> None:
     assert broken(ran) == [], ran.stdout
     assert [name for name in CONTRACTS if f"\n{name} KEPT" not in ran.stdout] == []
     assert ran.returncode == 0
+
+
+def test_pre_commit_runs_the_lint_of_ci() -> None:
+    hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"][0]["hooks"]
+    script = (ROOT / ".ci" / "run").read_text()
+    assert [hook["name"] for hook in hooks] == ["ruff check", "ruff format --check", "mypy", "lint-imports"]
+    assert all(re.search(rf"^{hook['name']}\b", script, re.MULTILINE) for hook in hooks)
+    assert all(hook["entry"].startswith(hook["name"]) and hook["language"] == "system" for hook in hooks)
 
 
 def test_every_contract_has_an_offence_that_breaks_it() -> None:
@@ -121,5 +132,5 @@ def test_simulators_and_conformance_kits_are_imported_when_they_are_called(packa
 @pytest.mark.parametrize("protocol", ["tcpudp", "wc2ec"])
 def test_a_gateway_loads_numpy_only_when_an_array_comes(protocol: str) -> None:
     loads = f"import gateways.{protocol}, zbridge.app, zbridge.bus.zenoh, zbridge.robot.device, sys"
-    ran = subprocess.run([sys.executable, "-c", f"{loads}; sys.exit('numpy' in sys.modules)"], cwd=ROOT)
+    ran = subprocess.run([sys.executable, "-c", f"{loads}; sys.exit('numpy' in sys.modules)"], cwd=ROOT, check=False)
     assert ran.returncode == 0

@@ -5,6 +5,7 @@ controllerArgs ["27015"] (one port per robot; 27015 without arguments). It serve
 gateway disconnects, it stops the motors and listens again. See README.md beside this file.
 """
 
+import math
 import socket
 import struct
 import sys
@@ -96,7 +97,7 @@ class Bridge:
 
     def set(self, number, value):
         motor = self.motors.get(number)
-        if motor is None or value != value or value in (float("inf"), float("-inf")):
+        if motor is None or not math.isfinite(value):
             return
         if motor.getType() == Node.ROTATIONAL_MOTOR:
             most = motor.getMaxVelocity()

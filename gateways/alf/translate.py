@@ -25,7 +25,7 @@ from zbridge.protocol import (
     NotReady,
     Outcome,
     ProtocolError,
-    Robot,
+    RobotSide,
     Telemetry,
     Translate,
     Unsupported,
@@ -67,7 +67,7 @@ class AlfOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     gap_s: Annotated[float, msgspec.Meta(ge=0, le=0.02)] = 0.0
 
 
-class AlfRobot(Robot):
+class AlfRobot(RobotSide):
     """One vehicle, with one link or two; the first link drives."""
 
     hands_over = True

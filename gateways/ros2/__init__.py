@@ -16,7 +16,7 @@ from zbridge.protocol import (
     KeyedSample,
     Metrics,
     Protocol,
-    Robot,
+    RobotSide,
     SampleKind,
     Simulation,
     read_sample,
@@ -51,7 +51,7 @@ shared = false                          # true: another node (Nav2) drives it to
 """
 
 
-def _robot(options: RosOptions, links: int, metrics: Metrics) -> Robot:
+def _robot(options: RosOptions, links: int, metrics: Metrics) -> RobotSide:
     from gateways.ros2.translate import RosRobot  # loads numpy
 
     return RosRobot(options, links, metrics)

@@ -33,7 +33,7 @@ from zbridge.protocol import (
     NotReady,
     Outcome,
     ProtocolError,
-    Robot,
+    RobotSide,
     Telemetry,
     Translate,
     Unsupported,
@@ -57,7 +57,7 @@ _LEVEL_RAD = 1e-3
 _NS_PER_MS = 1_000_000
 
 
-class RosRobot(Robot):
+class RosRobot(RobotSide):
     """One ROS 2 robot: the nodes on the other side of its router."""
 
     link_names = ("router",)
@@ -159,7 +159,7 @@ class RosRobot(Robot):
         )
 
     def _battery(self, message: BatteryState, stamp_ns: int) -> tuple[Telemetry, ...]:
-        """A value that is not known is NaN; the states of charging are those of the message's constants."""
+        """Translate a battery. An unknown value is NaN; the states of charging are the message's constants."""
         body = message.body
         level, charging = _known(body.percentage), _CHARGING.get(int(body.power_supply_status))
         _require(level is None or 0.0 <= level <= 1.0, f"a battery that is {level} full")
@@ -169,7 +169,7 @@ class RosRobot(Robot):
         return ((topics.BATTERY, battery),)
 
     def _image(self, message: CompressedImage, stamp_ns: int) -> tuple[Telemetry, ...]:
-        """The format of a message may say more: ``rgb8; jpeg compressed bgr8``."""
+        """Translate an image whose format may say more than its name: ``rgb8; jpeg compressed bgr8``."""
         words = str(message.body.format).lower()
         found = next((name for word, name in _FORMATS if word in words), None)
         if found is None:

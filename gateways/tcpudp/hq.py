@@ -63,7 +63,7 @@ class TcpUdpHq(HqSide):
         return ClientIds(CLIENTS, self.options.quiet_s)
 
     def initial_commands(self) -> tuple[Telemetry, ...]:
-        """A client drives only after it has sent control mode 2 or 3."""
+        """Give mode none: a client drives only after it has sent control mode 2 or 3."""
         return ((topics.CMD_MODE, Mode("none")),)
 
     def session(self, number: int, bounds: Limits) -> TcpUdpClient:

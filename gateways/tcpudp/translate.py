@@ -35,7 +35,7 @@ from zbridge.protocol import (
     NotReady,
     Outcome,
     Refused,
-    Robot,
+    RobotSide,
     Telemetry,
     Translate,
     Unsupported,
@@ -58,7 +58,7 @@ _MOTION = "motion"
 _NOTHING = Outcome()
 
 
-class TcpUdpRobot(Robot):
+class TcpUdpRobot(RobotSide):
     """One robot of the TCP/UDP package protocol, seen from its HQ."""
 
     hands_over = True

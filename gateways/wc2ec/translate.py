@@ -35,7 +35,7 @@ from zbridge.protocol import (
     NotReady,
     Outcome,
     ProtocolError,
-    Robot,
+    RobotSide,
     Telemetry,
     Translate,
     Unsupported,
@@ -53,7 +53,7 @@ def _interpolation(table: tuple[tuple[float, float], ...]) -> Callable[[float], 
     return lambda value: float(np.interp(value, measured, meant))
 
 
-class Wc2EcRobot(Robot):
+class Wc2EcRobot(RobotSide):
     """One Webots robot, seen from its external controller."""
 
     hands_over = True

@@ -1,5 +1,7 @@
-"""Drives that nobody may give, in four kinds by turns: the driver's public lease with a proof made up, the driver's own
-attachments with another payload, a proof of an ended lease, none at all.
+"""Drives that nobody may give, in four kinds by turns.
+
+The driver's public lease with a proof made up, the driver's own attachments with another payload, a proof of an ended
+lease, none at all.
 
 ``python -m tests.benchmarks.adversary ENDPOINT``; ``arm LEASE ENDED FIRST_SEQ LAST_SEQ COUNT`` makes them ready, where
 both leases are ``ID:TOKEN``; ``go RATE_HZ`` sends them (0: as fast as Zenoh takes them). They block where the bus is

@@ -28,8 +28,8 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
 from tests.e2e.conftest import Gateway, configuration, device, until
-from tests.e2e.processes import Part
-from tests.e2e.robots import Robot, position
+from tests.e2e.rigs.processes import Part
+from tests.e2e.rigs.robots import Robot, position
 from tests.ports import free_port
 from tests.views.protobuf import read
 from zbridge.views.schemas import foxglove_schema

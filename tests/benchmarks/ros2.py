@@ -42,7 +42,7 @@ from tests.benchmarks.ros2_scene import (
     vehicles_scan,
 )
 from tests.e2e.conftest import Lease
-from tests.e2e.robots import SCALE, Robot
+from tests.e2e.rigs.robots import SCALE, Robot
 from tests.proofs import packed
 
 RATE_HZ, PAUSE_S, WARM, BLOCKS = 10.0, 0.005, 20, 20

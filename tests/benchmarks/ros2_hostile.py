@@ -21,10 +21,10 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from tests.benchmarks.harness import cpu_s
-from tests.e2e import ros_robot
 from tests.e2e.conftest import repeated
-from tests.e2e.processes import Part
-from tests.e2e.ros2_scene import FRAGILE, SCAN, TWIST, FragileInFleet, RosScene
+from tests.e2e.measured import ros_robot
+from tests.e2e.rigs.processes import Part
+from tests.e2e.rigs.ros2_scene import FRAGILE, SCAN, TWIST, FragileInFleet, RosScene
 from tests.views.ros2.judge import DEFAULT, Publisher, Ros
 
 STRING, TRIGGER, SET_BOOL = "std_msgs/msg/String", "std_srvs/srv/Trigger", "std_srvs/srv/SetBool"
@@ -46,7 +46,7 @@ class Attacker:
     def __init__(self, endpoint: str, seconds: float, topic: str, type_name: str) -> None:
         self.ros = Ros(endpoint, "stranger")
         self.topic, self.type_name = topic, type_name
-        self.key, _ = self.ros._names(topic, type_name)
+        self.key, _ = self.ros.names(topic, type_name)
         self.rng = random.Random(1)
         self._ends_at = time.monotonic() + seconds
         self.sent = 0
@@ -122,16 +122,16 @@ def full(attacker: Attacker) -> None:
 
 def types(attacker: Attacker) -> None:
     """A thousand nodes whose publishers have other types and hashes, and their messages under those keys."""
-    ros, place = attacker.ros, attacker.ros._place
+    ros, place = attacker.ros, attacker.ros.place
     for number in range(NODES):
         name = f"{place[0]}/{number + 10}"
-        ros._kept.append(ros._token(f"{name}/NN/%/%/n{number}"))
+        ros.declare(f"{name}/NN/%/%/n{number}")
     wrong = [ros.publisher(attacker.topic, STRING) for _ in range(NODES // 2)]
-    _, named = ros._names(attacker.topic, attacker.type_name)
+    _, named = ros.names(attacker.topic, attacker.type_name)
     other = named.replace("RIHS01_", "RIHS01_0")[: len(named)]
     for number in range(NODES // 2):
         token = f"{place[0]}/{number + 5000}/MP/{place[1]}/{other}/{DEFAULT}"
-        ros._kept.append(ros._token(token))
+        ros.declare(token)
     attacker.puts(((whole(attacker), beside(wrong[0].gid)) for _ in iter(int, 1)), wrong[0].key)
 
 
@@ -150,7 +150,7 @@ def churn(attacker: Attacker) -> None:
 def calls(attacker: Attacker) -> None:
     """Requests of services that are none."""
     rng, ros, robot = attacker.rng, attacker.ros, attacker.topic.rpartition("/")[0]
-    keys = [ros._names(f"{robot}/{name}", kind)[0] for name, kind in (("stop", TRIGGER), ("set_light", SET_BOOL))]
+    keys = [ros.names(f"{robot}/{name}", kind)[0] for name, kind in (("stop", TRIGGER), ("set_light", SET_BOOL))]
     attachments = [None, b"", bytes(32), rng.randbytes(33), beside(bytes(16), -1)]
 
     def call() -> int:

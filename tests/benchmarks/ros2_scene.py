@@ -23,7 +23,7 @@ import zenoh
 
 from tests.benchmarks import alf_wire
 from tests.e2e.conftest import Gateway, configuration, device, end, start
-from tests.e2e.processes import Part
+from tests.e2e.rigs.processes import Part
 from tests.ports import free_port
 from tests.views.ros2.judge import Ros
 
@@ -136,7 +136,7 @@ class Scene:
 
     def key(self, robot: str, kind: str = SCAN, name: str = "scan") -> str:
         """Give the key of a topic of a robot on ROS's side."""
-        return self.ros._names(f"/{robot}/{name}", kind)[0]
+        return self.ros.names(f"/{robot}/{name}", kind)[0]
 
     def twists(self, robot: str) -> str:
         """Give the key of a robot's cmd_vel."""

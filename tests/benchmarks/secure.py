@@ -30,7 +30,7 @@ from tests.benchmarks.harness import Process, cpu_s, process
 from tests.benchmarks.paced import FULL, Lane, Plan, interval
 from tests.benchmarks.peer import ROBOT
 from tests.certificates import Authority
-from tests.e2e.secure import FAR, SecureBus
+from tests.e2e.rigs.secure import FAR, SecureBus
 from tests.ports import free_port
 from zbridge.security.roles import Member, Roles, save_roles
 

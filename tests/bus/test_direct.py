@@ -113,7 +113,7 @@ def test_the_threads_whose_state_is_kept_are_bounded(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(declared, "_known", itertools.count())
     monkeypatch.setattr(declared, "_keep_state", lambda: kept.append(threading.get_ident()))
     for _ in range(declared.KNOWN_THREADS + 5):
-        thread = threading.Thread(target=declared._get_known)
+        thread = threading.Thread(target=declared.keep_thread)
         thread.start()
         thread.join()
     assert len(kept) == declared.KNOWN_THREADS

@@ -58,7 +58,7 @@ class Scene:
 
     def watch(self, anybody: bool) -> None:
         """Let the first listener on the bus come, or the last one go."""
-        self.camera._demand.listen(anybody)
+        self.camera.demand.listen(anybody)
 
     def read(self, *pictures: bytes, bad: int = 0) -> None:
         """Give the camera what one read of its stream brought."""
@@ -130,12 +130,12 @@ async def test_images_are_published_with_size_and_time_and_the_newest_at_the_rat
 
 async def test_nothing_is_published_for_clients_of_the_relay_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     async with serving(Scene(monkeypatch)) as scene:
-        scene.camera._demand.join()
+        scene.camera.demand.join()
         await asyncio.sleep(0.01)
         scene.read(jpeg(1))
         assert scene.images() == []
         assert scene.counts()["pictures"] == 1
-        assert (await scene.camera._latest.after(0)).part.jpeg == jpeg(1)
+        assert (await scene.camera.latest.after(0)).part.jpeg == jpeg(1)
 
 
 async def test_a_fault_is_shown_until_a_picture_comes_and_tried_again_later_and_later(
@@ -206,7 +206,7 @@ async def test_pictures_of_a_stream_that_has_ended_are_forgotten(monkeypatch: py
         await asyncio.sleep(0.1)
         with pytest.raises(TimeoutError):
             async with asyncio.timeout(1.0):
-                await scene.camera._latest.after(0)
+                await scene.camera.latest.after(0)
         assert [each.data for each in scene.images()] == [jpeg(1), jpeg(2)], "the third was not due yet"
 
 

@@ -6,6 +6,7 @@ import random
 
 import pytest
 
+from tests.bounds import most_kept
 from tests.camera.camera_bytes import HEAD, jpeg, part
 from zbridge.camera.mjpeg import HEAD_BYTES, PICTURE_BYTES, MjpegReader
 from zbridge.errors import ProtocolError
@@ -142,7 +143,7 @@ def test_what_is_kept_of_a_stream_that_never_ends_a_picture_is_bounded() -> None
         nonlocal most
         for _ in range(100):
             reader.receive(bytes(64 * 1024))
-            most = max(most, len(reader._buffer))
+            most = max(most, most_kept(reader))
 
     with pytest.raises(ProtocolError):
         flood()

@@ -21,7 +21,7 @@ from zbridge import cli
 from zbridge.bus import Answer, Bus, Sample
 from zbridge.bus.fake import FakeBus
 from zbridge.cli import LineFormatter
-from zbridge.cli.demo import Watch
+from zbridge.cli.demo import LiveTable
 from zbridge.cli.drive import Session
 from zbridge.errors import LeaseLost
 from zbridge.fleet import topics
@@ -68,7 +68,7 @@ class Hostile(FakeBus):
         return await super().ask(key_expr, payload, timeout_s=timeout_s)
 
     def join(self, zid: str) -> Hostile:
-        return Hostile(zid, self._shared)
+        return Hostile(zid, self.network)
 
 
 @pytest.fixture
@@ -193,7 +193,7 @@ def test_what_drive_says_while_it_drives_and_errors_are_one_line(capsys: pytest.
 
 
 def test_the_table_of_the_demo() -> None:
-    watch = Watch([NAME])
+    watch = LiveTable([NAME])
     control = {**FREE, "state": "held", "holder": EVIL}
     pose = {"x": float("nan"), "y": float("inf"), "heading": 1e308}
     for path, fields in (("status", STATUS), ("control", control), ("pose", pose)):

@@ -22,7 +22,7 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, FleetMessage, Pose, Status
 from zbridge.fleet.topics import KeySpace, Topic
 from zbridge.metrics import Metrics
-from zbridge.protocol.plugin import Outcome, Robot
+from zbridge.protocol.plugin import Outcome, RobotSide
 from zbridge.protocol.session import State
 from zbridge.robot.commands import Commands
 
@@ -34,7 +34,7 @@ def raw_ms() -> float:
     return asyncio.get_running_loop().time() * 1000
 
 
-class Machine(Robot):
+class Machine(RobotSide):
     """A robot that takes every command and keeps it; ``refusal`` and ``unstoppable`` say why not, ``left_out`` what."""
 
     link_names = ("robot",)
@@ -180,7 +180,7 @@ async def settle() -> None:
 
 def subscriptions(bus: FakeBus, key: str) -> int:
     """Count the subscriptions of this very key."""
-    return sum(key_expr == key for key_expr, _ in bus._shared.subscribers)
+    return sum(key_expr == key for key_expr, _ in bus.network.subscribers)
 
 
 def tokens(bus: FakeBus, name: str = "r1") -> list[str]:
@@ -191,4 +191,4 @@ def tokens(bus: FakeBus, name: str = "r1") -> list[str]:
 def numbered_tokens(bus: FakeBus, name: str = "r1") -> list[str]:
     """List the liveliness tokens of programs that drive."""
     prefix = f"fleet/{name}/@alive/"
-    return [token.removeprefix(prefix) for token in bus._shared.tokens if token.startswith(prefix + "operator.")]
+    return [token.removeprefix(prefix) for token in bus.network.tokens if token.startswith(prefix + "operator.")]

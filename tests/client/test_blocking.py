@@ -75,7 +75,7 @@ class Bus(FakeBus):
     """Remembers that it was left."""
 
     def __init__(self, world: World) -> None:
-        super().__init__("mine", world.bus._shared)
+        super().__init__("mine", world.bus.network)
         self._world = world
 
     async def close(self) -> bool:

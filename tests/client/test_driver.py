@@ -73,7 +73,7 @@ class World(tests.client.World):
     def garble(self, topic: Topic) -> Handle:
         """Have somebody answer a question with nonsense, before the gateway does."""
         nonsense = self.bus.answer(f"fleet/r1/{topic.path}", lambda question: question.answer(b"\xc1"))
-        queryables = self.bus._shared.queryables
+        queryables = self.bus.network.queryables
         queryables.insert(0, queryables.pop())
         return nonsense
 
@@ -144,10 +144,10 @@ async def test_a_liveliness_token_tells_while_the_program_lives_and_is_there_bef
         (earlier,) = numbered_tokens(world.bus)
     async with world.robot.control(ME) as drive:
         (token,) = numbered_tokens(world.bus)
-        world.bus._shared.tell(f"fleet/r1/@alive/{earlier}", False)
+        world.bus.network.notify(f"fleet/r1/@alive/{earlier}", False)
         assert world.state == "held", "the end of an earlier token that is heard of late"
         await drive(forward=0.1)
-        world.bus._shared.tell(f"fleet/r1/@alive/{token}", False)
+        world.bus.network.notify(f"fleet/r1/@alive/{token}", False)
         assert world.state == "stopped"
 
 
@@ -319,7 +319,7 @@ class SlowBus(FakeBus):
     publishers = 0
 
     def __init__(self, world: World) -> None:
-        super().__init__("slow", world.bus._shared)
+        super().__init__("slow", world.bus.network)
         self.queue: list[Callable[[], object]] = []
 
     async def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:

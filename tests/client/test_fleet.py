@@ -52,7 +52,7 @@ class World(tests.client.World):
 
     def taken(self, path: str) -> list[Sample]:
         """Give the samples that came on a key of r1."""
-        return [sample for sample in self.bus._shared.history if sample.key == f"fleet/r1/{path}"]
+        return [sample for sample in self.bus.network.history if sample.key == f"fleet/r1/{path}"]
 
 
 async def test_a_robot_has_a_feed_of_every_message_that_is_published() -> None:
@@ -179,7 +179,7 @@ async def test_refusals_of_long_ago_or_of_a_listener_are_none_of_this_stop() -> 
     world.bus.subscribe(
         "fleet/r1/@cmd/stop", lambda _: world.gateway.authority.refuse("stop", forged, "hq.x.1", by="hq.x")
     )
-    subscribers = world.bus._shared.subscribers
+    subscribers = world.bus.network.subscribers
     subscribers.insert(0, subscribers.pop())
     await world.robot.stop()
     assert world.stopped == ["r1"]
@@ -213,7 +213,7 @@ class SlowToAsk(FakeBus):
 async def test_a_stop_is_sent_before_anything_is_asked_and_although_a_state_cannot_be_read(topic: Topic) -> None:
     world = World("r1")
     world.gateway.put(topic, b"\xc1")
-    stopping = asyncio.create_task(Fleet(SlowToAsk("slow", world.bus._shared))["r1"].stop())
+    stopping = asyncio.create_task(Fleet(SlowToAsk("slow", world.bus.network))["r1"].stop())
     await asyncio.sleep(0.05)
     assert world.stopped == ["r1"]
     assert not stopping.done()

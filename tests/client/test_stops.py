@@ -65,11 +65,11 @@ class LosesWildcards(FakeBus):
 
 async def test_a_robot_that_the_stop_of_all_did_not_reach_is_latched_by_name_and_released_with_the_others() -> None:
     world = World("r1", "r2")
-    fleet = Fleet(LosesWildcards("mine", world.bus._shared))
+    fleet = Fleet(LosesWildcards("mine", world.bus.network))
     assert await fleet.latch(reason="fire") == {"r1": None, "r2": None}
     assert [fleetwide for _, _, fleetwide in latches(world)] == [False]
     stop = world.bus.join("late").publisher("fleet/*/@cmd/stop", topics.CMD_STOP)
-    sent = next(sample for sample in world.bus._shared.history if sample.key == "fleet/r1/@cmd/stop")
+    sent = next(sample for sample in world.bus.network.history if sample.key == "fleet/r1/@cmd/stop")
     world.gateways["r2"].commands.take(Sample("fleet/*/@cmd/stop", sent.payload))
     assert [fleetwide for _, _, fleetwide in latches(world, "r2")] == [True]
     assert await fleet.unlatch() == {"r1": None, "r2": None}

@@ -9,6 +9,7 @@ from collections.abc import Iterable
 
 import pytest
 
+from tests.bounds import most_kept
 from tests.proofs import Holder, lease, numbered, packed, shown
 from zbridge.bus import Lane
 from zbridge.control import admission
@@ -175,4 +176,4 @@ def test_who_asks_too_often_for_a_lease_costs_only_its_own_name_and_many_names_h
     assert filter_(ACQUIRE + "noise", None, 0, bytes) is Lane.OTHER
     lanes = Counter(filter_(f"{ACQUIRE}n{number}", None, 0, bytes) for number in range(FLOOD))
     assert lanes[Lane.OTHER] == admission.ALL_NAMES_HZ - 1
-    assert len(filter_._names) == admission.NAMES, "the others are forgotten"
+    assert most_kept(filter_) == admission.NAMES, "the others are forgotten"

@@ -321,6 +321,11 @@ def told(monkeypatch: pytest.MonkeyPatch) -> Told:
 FULL = "No space left on device"
 
 
+def is_open_on(descriptor: int, file: os.stat_result) -> bool:
+    """Tell whether a descriptor is of this file."""
+    return os.path.samestat(os.fstat(descriptor), file)
+
+
 @pytest.mark.parametrize(
     ("make", "why", "lines"),
     [(lambda path: path.symlink_to("/dev/full"), FULL, 100), (os.mkfifo, "No such device or address", 1)],
@@ -331,12 +336,13 @@ def test_what_cannot_be_written_until_the_end_keeps_nobody_from_ending_and_is_co
 ) -> None:
     path = tmp_path / "audit.jsonl"
     make(path)
+    threads = threading.active_count()
     file = opened(path, metrics, tell=told.put)
     for number in range(lines):
         file.write(f"line {number}")
     hear(told, why)
     file.close()
-    assert not file._writer.is_alive()
+    assert threading.active_count() == threads
     assert metrics.count("audit_dropped").value == lines
     assert "Traceback" not in capfd.readouterr().err
 
@@ -346,9 +352,10 @@ def test_a_full_disk_is_said_once_and_what_waits_is_written_when_it_has_room_aga
 ) -> None:
     path, write, full = tmp_path / "audit.jsonl", os.write, threading.Event()
     file = opened(path, metrics, tell=told.put)
+    there = path.stat()
 
     def short_of_room(descriptor: int, data: bytes) -> int:
-        if descriptor != file._file._descriptor:
+        if not is_open_on(descriptor, there):
             return write(descriptor, data)
         if full.is_set():
             raise OSError(errno.ENOSPC, FULL)
@@ -403,11 +410,13 @@ class Disk:
     """An audit file whose thread stands still in the midst of writing, and as many lines as may wait."""
 
     def __init__(self, path: Path, metrics: Metrics, monkeypatch: pytest.MonkeyPatch) -> None:
+        before = set(threading.enumerate())
         self.file = opened(path, metrics, file_bytes=1_000_000)
-        self.moves, held, write = threading.Event(), threading.Event(), os.write
+        self.writers = lambda: set(threading.enumerate()) - before
+        self.moves, held, write, there = threading.Event(), threading.Event(), os.write, path.stat()
 
         def stand_still(descriptor: int, data: bytes) -> int:
-            if descriptor == self.file._file._descriptor:
+            if is_open_on(descriptor, there):
                 held.set()
                 self.moves.wait(JOIN_S)
             return write(descriptor, data)
@@ -441,7 +450,8 @@ def test_a_disk_that_never_moves_again_keeps_nobody_from_ending_and_what_is_give
 ) -> None:
     monkeypatch.setattr("zbridge.control.audit_log.CLOSE_S", 0.001)
     disk.file.close()
-    assert disk.file._writer.is_alive(), "nobody waited for the disk"
+    (writer,) = disk.writers()
+    assert writer.is_alive(), "nobody waited for the disk"
     assert metrics.total("audit_dropped") == WAITING
     disk.moves.set()
-    disk.file._writer.join(JOIN_S)
+    writer.join(JOIN_S)

@@ -105,7 +105,7 @@ def test_every_credential_of_a_unit_is_used_under_its_name() -> None:
 @every_unit
 def test_systemd_calls_a_unit_hardly_exposed(unit: Path) -> None:
     command = ("systemd-analyze", "security", "--offline=true", f"--threshold={EXPOSURE}", str(unit))
-    told = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    told = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     if "Unknown option" in told.stderr or "unrecognized option" in told.stderr:
         pytest.skip("this machine's systemd-analyze cannot look at files")
     assert told.returncode == 0, told.stdout[-200:] + told.stderr
@@ -117,6 +117,10 @@ def test_systemd_understands_every_line_of_a_unit(unit: Path, tmp_path: Path) ->
     copy = tmp_path / unit.name
     copy.write_text(unit.read_text().replace("/opt/zbridge/bin/zbridge", "/bin/true"))
     told = subprocess.run(
-        ("systemd-analyze", "verify", "--man=no", str(copy)), capture_output=True, text=True, timeout=60
+        ("systemd-analyze", "verify", "--man=no", str(copy)),
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
     )
     assert [line for line in told.stderr.splitlines() if str(copy) in line] == []

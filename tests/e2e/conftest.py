@@ -18,7 +18,7 @@ import msgpack
 import pytest
 import zenoh
 
-from tests.e2e.robots import Robot
+from tests.e2e.rigs.robots import Robot
 from tests.machine import Patience, Withheld, contended_s
 from tests.ports import HOST, free_port
 from tests.proofs import Holder, packed

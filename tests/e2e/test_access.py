@@ -18,7 +18,7 @@ import zenoh
 from tests.access import COLUMNS, LAB, Try, granted_by_the_code, table
 from tests.certificates import Authority
 from tests.e2e.conftest import until
-from tests.e2e.secure import FAR, GRACE_S, ROLES, Matrix, SecureBus, declared, ignore, secure, text
+from tests.e2e.rigs.secure import FAR, GRACE_S, ROLES, Matrix, SecureBus, declared, ignore, secure, text
 from zbridge.security.access import STOPS_HZ, Column
 from zbridge.security.roles import Roles
 

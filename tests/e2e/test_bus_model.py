@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from tests.e2e.processes import NotHereError, apart
+from tests.e2e.rigs.processes import NotHereError, apart
 from tests.simulated.bus_validation import played_model
 from tests.simulated.bus_validation.trace import Trace
 from tests.simulated.bus_validation.traces import TRACES

@@ -18,8 +18,8 @@ import zenoh
 
 from tests.camera.camera_bytes import HEAD, jpeg
 from tests.e2e.conftest import Bench, Fleet, device, end, until
-from tests.e2e.fake_camera import FakeCamera
-from tests.e2e.foxglove_viewer import viewing
+from tests.e2e.rigs.fake_camera import FakeCamera
+from tests.e2e.rigs.foxglove_viewer import viewing
 from tests.ports import free_port
 from tests.views.protobuf import read
 from tests.views.recording import files

@@ -12,9 +12,9 @@ import pytest
 import zenoh
 
 from tests.e2e.conftest import WAIT_S, Bench, Fleet, Gateway, configuration, device, end, start, until
-from tests.e2e.relay import Relay
-from tests.e2e.robots import Robot
-from tests.e2e.supervised import Supervised
+from tests.e2e.rigs.relay import Relay
+from tests.e2e.rigs.robots import Robot
+from tests.e2e.rigs.supervised import Supervised
 from tests.machine import Patience
 from tests.ports import free_port
 from tests.proofs import packed

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from tests.e2e.conftest import Bench, device, end, listener, start, until
-from tests.e2e.robots import Robot
+from tests.e2e.rigs.robots import Robot
 from tests.ports import free_port
 from zbridge.protocol.plugin import find_protocol, protocol_names
 

@@ -8,7 +8,7 @@ from typing import Any
 import zenoh
 
 from tests.e2e.conftest import Bench, ask, configuration, until
-from tests.e2e.robots import MOVE, ROTATE, Robot
+from tests.e2e.rigs.robots import MOVE, ROTATE, Robot
 from tests.proofs import Holder, packed, shown
 
 DRIVE = "fleet/r1/@cmd/drive"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.e2e.fight import faults, fight, holder_of
+from tests.e2e.measured.fight import faults, fight, holder_of
 
 
 def test_two_drivers_never_move_a_robot_at_the_same_time_and_the_audit_log_tells_all() -> None:

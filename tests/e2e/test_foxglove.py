@@ -17,7 +17,7 @@ from websockets.exceptions import ConnectionClosed, InvalidMessage, InvalidStatu
 
 from tests.certificates import Authority
 from tests.e2e.conftest import HOST, Bench, until
-from tests.e2e.foxglove_viewer import Viewer, viewing
+from tests.e2e.rigs.foxglove_viewer import Viewer, viewing
 from tests.ports import free_port
 from tests.views.foxglove.recordings import BEGIN_NS, record
 from tests.views.protobuf import read

@@ -14,10 +14,10 @@ import pytest
 
 import zbridge
 from tests.e2e.conftest import Bench, Fleet, device, end, until
-from tests.e2e.fragile import DISTURBED, Fragile, charges, disturbed, fragile_robot
-from tests.e2e.hq_judge import commanded
-from tests.e2e.judge import VERSIONS, judge
-from tests.e2e.wc2ec_judge import judge as wc2ec_judge
+from tests.e2e.measured.hq_judge import commanded
+from tests.e2e.measured.judge import VERSIONS, judge
+from tests.e2e.measured.wc2ec_judge import judge as wc2ec_judge
+from tests.e2e.rigs.fragile import DISTURBED, Fragile, charges, disturbed, fragile_robot
 
 
 @pytest.mark.parametrize("udp", [False, True], ids=["tcp", "udp"])

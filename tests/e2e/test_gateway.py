@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 
 from tests.e2e.conftest import WAIT_S, Bench, device, end, until
-from tests.e2e.loss import router
-from tests.e2e.robots import MOVE, SETTINGS, STOP, Robot
+from tests.e2e.rigs.loss import router
+from tests.e2e.rigs.robots import MOVE, SETTINGS, STOP, Robot
 from tests.ports import free_port
 
 TEXT, MODE = 1, 10

@@ -15,11 +15,11 @@ from gateways.alf.conformance.fragile_hq import FragileAlfHq
 from gateways.tcpudp.conformance.fragile_hq import FragileTcpUdpHq
 from gateways.wc2ec.conformance.fragile_hq import FragileExternalController
 from tests.e2e.conftest import HOST, Bench, device, listener
-from tests.e2e.fragile import charges
-from tests.e2e.hq_churn import churn
-from tests.e2e.hq_judge import judge
-from tests.e2e.hq_scene import NEUTRAL, ByHand, playing, ports, sessions, soon
-from tests.e2e.robots import SETTINGS, Robot, position
+from tests.e2e.measured.hq_churn import churn
+from tests.e2e.measured.hq_judge import judge
+from tests.e2e.rigs.fragile import charges
+from tests.e2e.rigs.hq_scene import NEUTRAL, ByHand, playing, ports, sessions, soon
+from tests.e2e.rigs.robots import SETTINGS, Robot, position
 
 # Every protocol and version at once
 

@@ -14,7 +14,7 @@ import pytest
 
 from tests.certificates import Authority
 from tests.e2e.conftest import HOST, Bench, Gateway, device, until
-from tests.e2e.hq_programs import tcpudp_by_tcp
+from tests.e2e.rigs.hq_programs import tcpudp_by_tcp
 from tests.ports import free_port
 
 

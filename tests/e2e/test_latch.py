@@ -11,8 +11,8 @@ import msgpack
 
 from gateways.tcpudp.conformance.fragile_hq import FragileTcpUdpHq
 from tests.e2e.conftest import HOST, Bench, ask, device, end, listener, start, until
-from tests.e2e.hq_scene import playing, soon
-from tests.e2e.restarts import Restarted
+from tests.e2e.measured.restarts import Restarted
+from tests.e2e.rigs.hq_scene import playing, soon
 from tests.ports import free_port
 
 

@@ -5,7 +5,7 @@ import json
 import sys
 import threading
 
-from tests.e2e.lines import Lines
+from tests.e2e.rigs.lines import Lines
 
 THREADS, EACH = 11, 200
 

@@ -6,9 +6,9 @@ import subprocess
 
 import pytest
 
-from tests.e2e import lost_hq
-from tests.e2e.lost_driver import measure
-from tests.e2e.processes import NotHereError, apart, module
+from tests.e2e.measured import lost_hq
+from tests.e2e.measured.lost_driver import measure
+from tests.e2e.rigs.processes import NotHereError, apart, module
 
 ROWS = [
     ("killed", 2.0),  # where others see the loss it is long before the deadman
@@ -50,6 +50,6 @@ def test_a_robot_whose_driver_is_unplugged_is_stopped_within_the_deadman(program
         apart()
     except NotHereError as error:
         pytest.skip(f"no network namespace for the driver: {error}")
-    command = module(*program, "--way", "cut", "--repetitions", 1)
+    command = module(f"tests.e2e.measured.{program[0]}", *program[1:], "--way", "cut", "--repetitions", 1)
     ran = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert ran.returncode == 0, ran.stdout + ran.stderr

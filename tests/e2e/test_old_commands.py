@@ -6,7 +6,7 @@ import subprocess
 
 import pytest
 
-from tests.e2e.processes import NotHereError, apart, module
+from tests.e2e.rigs.processes import NotHereError, apart, module
 
 TRIES = 4
 """Cuts of which one at least must hold something up that moves a robot which looks at no age."""
@@ -15,7 +15,9 @@ TRIES = 4
 def cut(age: str) -> str:
     """Cut the driver's network once for 2.3 s; tell what came of it."""
     wishes = ["--cuts", "2.3", "--repetitions", "1", "--age", age]
-    ran = subprocess.run(module("old_commands", *wishes), capture_output=True, text=True, timeout=90, check=False)
+    ran = subprocess.run(
+        module("tests.e2e.measured.old_commands", *wishes), capture_output=True, text=True, timeout=90, check=False
+    )
     assert ran.returncode == 0, f"{ran.stdout}{ran.stderr}"
     return ran.stdout
 

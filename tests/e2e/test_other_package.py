@@ -15,9 +15,9 @@ from gateways.alf.conformance.fragile_hq import FragileAlfHq
 from gateways.tcpudp.conformance.fragile_hq import FragileTcpUdpHq
 from gateways.wc2ec.conformance.fragile_hq import FragileExternalController
 from tests.e2e.conftest import HOST, Bench, device, listener
-from tests.e2e.fragile import charges
-from tests.e2e.hq_judge import LET_GO_S
-from tests.e2e.hq_scene import playing, ports, soon
+from tests.e2e.measured.hq_judge import LET_GO_S
+from tests.e2e.rigs.fragile import charges
+from tests.e2e.rigs.hq_scene import playing, ports, soon
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "khepera"
 PACKAGES = {"khepera": EXAMPLE / "khepera", "toy": Path(__file__).parent / "other_package" / "toyrobot.py"}

@@ -13,8 +13,8 @@ import pytest
 
 from tests import captures
 from tests.e2e.conftest import HOST, Bench, device, end, until
-from tests.e2e.hq_judge import Alf, Ec, Program, Tcp
-from tests.e2e.hq_scene import playing, soon
+from tests.e2e.measured.hq_judge import Alf, Ec, Program, Tcp
+from tests.e2e.rigs.hq_scene import playing, soon
 from tests.ports import free_port
 from tests.views.recording import files
 from zbridge.views.recording.reader import RecordingReader

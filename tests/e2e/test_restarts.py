@@ -13,11 +13,11 @@ from gateways.alf.conformance.fragile_hq import FragileAlfHq
 from gateways.tcpudp.conformance.fragile_hq import FragileTcpUdpHq
 from gateways.wc2ec.conformance.fragile_hq import FragileExternalController
 from tests.e2e.conftest import HOST, Bench, device, listener, start, until
-from tests.e2e.fragile import Fragile, charges
-from tests.e2e.hq_scene import playing, ports, soon
-from tests.e2e.processes import ROOT
-from tests.e2e.restarts import MOST_GAP_S, ROBOTS, Restarted, restart
-from tests.e2e.robots import MOVE, STOP, Robot
+from tests.e2e.measured.restarts import MOST_GAP_S, ROBOTS, Restarted, restart
+from tests.e2e.rigs.fragile import Fragile, charges
+from tests.e2e.rigs.hq_scene import playing, ports, soon
+from tests.e2e.rigs.processes import ROOT
+from tests.e2e.rigs.robots import MOVE, STOP, Robot
 from tests.ports import free_port
 from zbridge.app.handover.channel import VERSION
 

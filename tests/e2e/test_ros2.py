@@ -14,8 +14,8 @@ import pytest
 import zenoh
 
 from tests.e2e.conftest import Gateway, configuration, device, repeated, start, until
-from tests.e2e.robots import STOP, Robot
-from tests.e2e.ros2_scene import GRID, SCAN, STAMPED, TWIST, RosScene, pushed
+from tests.e2e.rigs.robots import STOP, Robot
+from tests.e2e.rigs.ros2_scene import GRID, SCAN, STAMPED, TWIST, RosScene, pushed
 from tests.ports import free_port
 from tests.views.ros2.judge import Publisher, Ros
 
@@ -171,7 +171,7 @@ def test_a_latched_robot_is_driven_by_no_publisher_before_it_is_unlatched(scene:
 def test_a_call_switches_and_a_malformed_one_has_an_error(scene: Scene) -> None:
     response, _ = scene.ros.call("/r1/set_light", SET_BOOL, scene.ros.request(SET_BOOL, data=True))
     assert response.success, response.message
-    key, _ = scene.ros._names("/r1/set_light", SET_BOOL)
+    key, _ = scene.ros.names("/r1/set_light", SET_BOOL)
     for payload, attachment in ((b"\x00\x01\x00\x00\x01", None), (b"\xff" * 300, bytes(33)), (b"", b"\x10" * 33)):
         replies = scene.ros.session.get(key, payload=payload, attachment=attachment, timeout=10.0)
         errors = [reply.err.payload.to_bytes() for reply in replies if reply.err is not None]
@@ -219,7 +219,7 @@ def test_garbage_wrong_types_and_strangers_are_counted_and_move_nothing(scene: S
             "0/7/MP/%/%/x/%r1%cmd_vel/y/z/::",
             "0/8/MP/%/%/x/%r1%cmd_vel/a::msg::dds_::B_/c/::,9:,:,:,,",
         ):
-            stranger._kept.append(stranger._token(f"{stranger.session.zid()}/{parts}"))
+            stranger.declare(f"{stranger.session.zid()}/{parts}")
         with pushed(publisher, 0.125, lambda: scene.moves(begun)):
             pass
         assert all(speed == pytest.approx(0.25) for speed in scene.moves(begun))

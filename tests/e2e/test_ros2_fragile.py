@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from tests.e2e.conftest import repeated
-from tests.e2e.ros2_scene import FULL_MPS, STAMPED, TWIST, FragileInFleet, RosScene
+from tests.e2e.rigs.ros2_scene import FULL_MPS, STAMPED, TWIST, FragileInFleet, RosScene
 
 FORWARD_MPS, TURN_RADPS = 0.25, 0.5
 

@@ -16,10 +16,10 @@ import zenoh
 
 from gateways.ros2.conformance.strict_robot import HASHES, config
 from tests.e2e.conftest import HOST, Bench, device, listener, until
-from tests.e2e.fragile import charges
-from tests.e2e.hq_judge import DRIVES, LEASE_S, Alf, Ec, Program, Tcp
-from tests.e2e.hq_scene import playing, ports, pushed, soon
-from tests.e2e.ros_robot import KEY, WAYS, Scene, measure
+from tests.e2e.measured.hq_judge import DRIVES, LEASE_S, Alf, Ec, Program, Tcp
+from tests.e2e.measured.ros_robot import KEY, WAYS, Scene, measure
+from tests.e2e.rigs.fragile import charges
+from tests.e2e.rigs.hq_scene import playing, ports, pushed, soon
 from tests.ports import free_port
 
 SCAN_KEY = f"0/scan/sensor_msgs::msg::dds_::LaserScan_/{HASHES['LaserScan']}"
@@ -77,7 +77,7 @@ def test_a_ros_robot_is_at_rest_after_a_stop_a_loss_and_beside_another_driver(wa
 def test_a_robot_in_a_namespace_that_takes_stamped_twists_on_a_clock_of_its_own(
     tmp_path: Path, stack: contextlib.ExitStack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tests.e2e.ros_robot.OPTIONS", 'namespace = "/robots/r1"\nspeed_full_mps = 1.0')
+    monkeypatch.setattr("tests.e2e.measured.ros_robot.OPTIONS", 'namespace = "/robots/r1"\nspeed_full_mps = 1.0')
     scene = Scene(tmp_path, stack, namespace="/robots/r1", stamped=True)
     robot, fleet, began = scene.robot, scene.bench.fleet, time.monotonic_ns()
     robot.clock_ns = lambda: time.monotonic_ns() - began  # a simulation, begun anew

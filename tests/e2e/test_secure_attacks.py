@@ -21,7 +21,7 @@ import zenoh
 import zbridge
 from tests.access import LAB, OTHER
 from tests.e2e.conftest import Bench, Gateway, ask, device, until
-from tests.e2e.secure import FAR, GRACE_S, SecureBus, declared
+from tests.e2e.rigs.secure import FAR, GRACE_S, SecureBus, declared
 from tests.proofs import Holder, packed
 from zbridge.bus.tls.files import folder_tls
 from zbridge.errors import BusError, LeaseLost, Malformed

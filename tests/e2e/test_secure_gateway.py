@@ -13,8 +13,8 @@ import pytest
 import zbridge
 from tests.access import LAB
 from tests.e2e.conftest import HOST, WAIT_S, Bench, Gateway, device, listener, until
-from tests.e2e.hq_programs import tcpudp_by_tcp
-from tests.e2e.secure import SecureBus
+from tests.e2e.rigs.hq_programs import tcpudp_by_tcp
+from tests.e2e.rigs.secure import SecureBus
 from tests.ports import free_port
 from zbridge.bus import BusSettings
 from zbridge.bus.tls.files import folder_tls

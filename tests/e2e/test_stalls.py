@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.e2e.processes import NotHereError, apart, module
-from tests.e2e.stalls import LIMIT_S, Case, measure
+from tests.e2e.measured.stalls import LIMIT_S, Case, measure
+from tests.e2e.rigs.processes import NotHereError, apart, module
 
 STALLED = ("alf", "tcpudp-1.3", "wc2ec")
 
@@ -28,6 +28,8 @@ def test_a_robot_whose_link_was_cut_while_it_was_driven_is_at_rest_after_it(tmp_
         pytest.skip(f"no network namespace for the robot: {error}")
     out = tmp_path / "cut.jsonl"
     wishes = ["--robots", "tcpudp-1.3", "--stalls", "", "--cuts", "2", "--repetitions", "1", "--out", str(out)]
-    ran = subprocess.run(module("stalls", *wishes), capture_output=True, text=True, timeout=90, check=False)
+    ran = subprocess.run(
+        module("tests.e2e.measured.stalls", *wishes), capture_output=True, text=True, timeout=90, check=False
+    )
     assert ran.returncode == 0, f"{ran.stdout}{ran.stderr}{out.read_text()}"
     assert json.loads(out.read_text())["rest_s"] <= LIMIT_S

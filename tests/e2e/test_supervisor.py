@@ -15,10 +15,10 @@ from pathlib import Path
 import pytest
 
 from tests.e2e.conftest import Bench, device, end, repeated, start, until
-from tests.e2e.crossings import Case, Outcome, measure
-from tests.e2e.robots import MOVE, STOP, Robot, position
-from tests.e2e.steps import AFTER_GIVEN, AFTER_GO, FIRST_READ
-from tests.e2e.supervised import Supervised
+from tests.e2e.measured.crossings import Case, Outcome, measure
+from tests.e2e.rigs.robots import MOVE, STOP, Robot, position
+from tests.e2e.rigs.steps import AFTER_GIVEN, AFTER_GO, FIRST_READ
+from tests.e2e.rigs.supervised import Supervised
 from zbridge.host.runner import RESUMED_CRASHES
 
 ROBOTS = 8

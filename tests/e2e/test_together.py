@@ -12,7 +12,7 @@ from pathlib import Path
 from tests.access import LAB
 from tests.benchmarks.fleet_robots import READING, REGISTERED
 from tests.e2e.conftest import HOST, WAIT_S, end, start
-from tests.e2e.secure import SecureBus
+from tests.e2e.rigs.secure import SecureBus
 from tests.e2e.test_secure_gateway import member
 from tests.simulated_robot import simulated
 from zbridge.bus.tls.files import folder_tls

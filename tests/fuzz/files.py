@@ -9,6 +9,7 @@ import tomllib
 from collections.abc import Iterator
 from typing import Any
 
+from tests.bounds import most_kept
 from tests.camera import camera_bytes
 from tests.fuzz.target import Target, comparable, cut, require_same
 from tests.views.recording import files as recorded
@@ -53,7 +54,7 @@ def _pictures(reads: list[bytes]) -> list[Any]:
         for read in reads:
             found = mjpeg.receive(read)
             parts += found
-            assert len(mjpeg._buffer) <= KEPT_BYTES
+            assert most_kept(mjpeg) <= KEPT_BYTES
             for part in found:
                 assert is_jpeg(part.jpeg)
                 jpeg_size(part.jpeg)
@@ -66,7 +67,7 @@ def _pictures(reads: list[bytes]) -> list[Any]:
 
 def answer_http(data: bytes) -> None:
     """Answer a request to the metrics endpoint."""
-    response = prometheus._response(data, Metrics(), lambda: ("not yet",))
+    response = prometheus.respond(data, Metrics(), lambda: ("not yet",))
     head, _, body = response.partition(b"\r\n\r\n")
     length = re.search(rb"Content-Length: ([0-9]+)", head)
     assert length is not None

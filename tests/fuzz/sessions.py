@@ -21,6 +21,7 @@ from gateways.ros2 import PROTOCOL as ROS2
 from gateways.tcpudp import PROTOCOL as TCPUDP
 from gateways.wc2ec import PROTOCOL as WC2EC
 from gateways.wc2ec import SIMULATED
+from tests.bounds import most_kept
 from tests.captures import stream
 from tests.fuzz.target import Target, chances, comparable, cut, require_same
 from tests.gateways.alf import golden as alf
@@ -79,7 +80,7 @@ def _in_time(make: Make, reads: Iterable[bytes], chance: Iterator[int]) -> None:
         with contextlib.suppress(Refused, EncodeError):
             command(now)
         _drain(session, now)
-        assert len(session._frames) <= session.limits.frame_bytes
+        assert most_kept(session) <= session.limits.frame_bytes
     session.snapshot()
     session.close("the end", now)
     _run_timers(session, now + 10.0)

@@ -65,7 +65,8 @@ class Scene:
 
     def __init__(self) -> None:
         self.channel, far = FdChannel.pair()
-        self.reporter, self.device = Reporter(FdChannel(far)), PlayedDevice()
+        self.far = FdChannel(far)
+        self.reporter, self.device = Reporter(self.far), PlayedDevice()
         self.descriptors = 0
         self.reporter.begin()
         received = self.channel.receive()
@@ -206,7 +207,7 @@ async def test_a_successor_is_asked_for_with_its_socket_and_the_answer_awaited(s
         await asking
         assert scene.reporter.handed_over(), "the supervisor looks after the robot"
         assert scene.told() == [Succeeded()]
-        while scene.reporter._channel.send(Heartbeat()):
+        while scene.far.send(Heartbeat()):
             pass
         with pytest.raises(HandoverError, match="does not listen"):
             scene.reporter.handed_over()

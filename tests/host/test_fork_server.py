@@ -11,8 +11,8 @@ import pytest
 from zbridge.errors import NotReady
 from zbridge.host import fork_client as module
 from zbridge.host.fd_channel import FdChannel, Fork
-from zbridge.host.fork_client import ForkClient, Stamp, fork_server_command
-from zbridge.host.supervisor import _become_reaper
+from zbridge.host.fork_client import ForkClient, Installation, fork_server_command
+from zbridge.host.supervisor import become_reaper
 
 SOON_S = 30.0
 
@@ -44,7 +44,7 @@ async def forked(made: ForkClient, file: Path, content: bytes = b"") -> int:
 
 
 async def test_a_forked_gateway_is_a_child_of_ours_and_shows_its_end(tmp_path: Path, capfd) -> None:
-    _become_reaper()
+    become_reaper()
     async with forks() as made:
         pids = [await forked(made, tmp_path / f"r{number}.toml") for number in range(2)]
         assert [await ended(pid) for pid in pids] == [2, 2], "the exit code of a faulty configuration"
@@ -62,7 +62,7 @@ async def test_a_protocol_that_cannot_be_loaded_stops_no_gateway_of_another_one(
     (about / "entry_points.txt").write_text("[zbridge.protocols]\ntorn = torn:PROTOCOL\n")
     (tmp_path / "torn.py").write_text("import sys\nsys.exit(5)\n")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, (str(tmp_path), os.environ.get("PYTHONPATH")))))
-    _become_reaper()
+    become_reaper()
     async with forks() as made:
         assert await ended(await forked(made, tmp_path / "r1.toml")) == 2
 
@@ -70,7 +70,7 @@ async def test_a_protocol_that_cannot_be_loaded_stops_no_gateway_of_another_one(
 async def test_a_forked_gateway_runs_by_the_content_that_it_is_given_not_by_what_the_file_holds(
     tmp_path: Path, capfd
 ) -> None:
-    _become_reaper()
+    become_reaper()
     file = tmp_path / "r1.toml"
     file.write_text("of = 'the file'\n")
     content = b"large = '%s'\ngiven = 1\n" % (200_000 * b"x")
@@ -117,8 +117,8 @@ class PlayedStamp:
 async def test_a_changed_installation_gets_a_server_of_its_own_and_a_broken_one_does_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(module, "Stamp", PlayedStamp)
-    _become_reaper()
+    monkeypatch.setattr(module, "Installation", PlayedStamp)
+    become_reaper()
 
     def changes(*, settled: bool = True) -> None:
         monkeypatch.setattr(PlayedStamp, "number", PlayedStamp.number + 1)
@@ -149,9 +149,9 @@ def test_the_stamp_of_an_installation_changes_with_its_code(tmp_path: Path, monk
     source = tmp_path / "code.py"
     source.write_text("a = 1\n")
     os.utime(source, (1e9, 1e9))
-    before = Stamp()
-    assert before == Stamp()
+    before = Installation()
+    assert before == Installation()
     source.write_text("a = 22\n")
-    after = Stamp()
+    after = Installation()
     assert after != before
     assert not after.settled

@@ -134,7 +134,7 @@ async def test_others_have_their_turn_while_a_process_tells_much(scene: Scene) -
 
 
 async def test_what_cannot_be_read_is_left_out(scene: Scene) -> None:
-    scene.told._socket.send(b"\xc1")
+    os.write(scene.told.fileno(), b"\xc1")
     scene.told.send(Heartbeat())
     scene.process.receive()
     assert scene.process.watchdog.heartbeats == 1

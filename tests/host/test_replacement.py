@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -19,7 +20,7 @@ from zbridge.host import replacement
 from zbridge.host import supervisor as module
 from zbridge.host.deposit import Deposit
 from zbridge.host.fd_channel import Deposited, FdChannel, Heartbeat, Opened, Shared
-from zbridge.host.files import Changes, RobotFile
+from zbridge.host.files import Changes, Follower, RobotFile
 from zbridge.host.fork_client import ForkClient
 from zbridge.host.memory import MemoryWriter
 from zbridge.host.process import GatewayProcess
@@ -218,16 +219,20 @@ async def test_a_runner_with_something_under_way_is_not_calm(
 ) -> None:
     made, _, _ = running
     assert made.process is not None
+    restarting: asyncio.Future[None] | None = None
     match what:
         case "killed":
             made.process.kill("hung")
         case "restarting":
-            made._restarting = 1
+            restarting = asyncio.ensure_future(made.restart(FILE))
+            await asyncio.sleep(0)
         case "given":
             made.process.deposit.predecessor = Deposit()
         case _:
             setattr(made.process, what, True)
     assert not made.is_idle
+    if restarting is not None:
+        restarting.cancel()
 
 
 async def test_a_resumed_runner_waits_for_its_next_process_until_the_same_time() -> None:
@@ -306,18 +311,17 @@ async def test_without_such_a_moment_nothing_is_replaced(monkeypatch: pytest.Mon
 
 
 async def test_files_are_read_off_the_event_loop_which_watches_the_gateways(monkeypatch: pytest.MonkeyPatch) -> None:
-    supervisor, looked = Supervisor((), HostSettings(), [], watch=True, verbose=False), threading.Event()
-    supervisor._forks = PlayedForks()  # type: ignore[assignment]
-    supervisor._code = "one"  # type: ignore[assignment]
+    forks: Any = PlayedForks()
+    supervisor, looked = Supervisor((), HostSettings(), forks, watch=True, verbose=False), threading.Event()
     seen: list[bool] = []
 
-    def poll(running: object, *, twice: bool) -> Changes:
+    def poll(_: Follower, running: object, *, twice: bool) -> Changes:
         seen.append(looked.wait(10.0))
         return Changes()
 
-    monkeypatch.setattr(supervisor._follower, "poll", poll)
-    supervisor._reload.set()
-    following = asyncio.ensure_future(supervisor._follow())
+    monkeypatch.setattr(Follower, "poll", poll)
+    supervisor.reload()
+    following = asyncio.ensure_future(supervisor.follow())
     asyncio.get_running_loop().call_later(0.01, looked.set)  # never called while the loop reads files
     async with asyncio.timeout(30.0):
         while not seen:  # noqa: ASYNC110
@@ -357,11 +361,12 @@ async def test_the_supervisor_is_replaced_when_its_fork_server_was_or_when_it_is
         raise HandoverError("not now")
 
     monkeypatch.setattr(module, "replace", refuse)
-    supervisor = Supervisor((), HostSettings(), [], watch=False, verbose=False, itself=["zbridge"])
-    supervisor._forks, supervisor._code = PlayedForks(), "one"  # type: ignore[assignment]
-    supervisor._forks.stamp, supervisor._forks.refused = stamp, refused  # type: ignore[misc]
-    supervisor._forced = forced
-    await supervisor._follow_code(asked=asked)
+    forks: Any = PlayedForks()
+    supervisor = Supervisor((), HostSettings(), forks, watch=False, verbose=False, itself=["zbridge"])
+    forks.stamp, forks.refused = stamp, refused
+    if forced:
+        supervisor.renew()
+    await supervisor.follow_code(asked=asked)
     assert len(calls) == replaced
-    await supervisor._follow_code(asked=False)
+    await supervisor.follow_code(asked=False)
     assert len(calls) == replaced, "what failed is tried again when somebody asks"

@@ -22,6 +22,7 @@ from zbridge.host.files import RobotFile, check
 from zbridge.host.memory import MemoryWriter
 from zbridge.host.process import GatewayProcess
 from zbridge.host.runner import RESUMED_CRASHES, Runner
+from zbridge.host.succession import Make
 from zbridge.robot.observer import LastStop, StopFrame
 from zbridge.wire.frames import Partial
 
@@ -112,7 +113,7 @@ class Child:
 class PlayedLauncher:
     """Starts children; keeps all of them, and the files that they run by."""
 
-    def __init__(self, make: Callable[[int, FdChannel, RobotFile], GatewayProcess], stream: socket.socket) -> None:
+    def __init__(self, make: Make, stream: socket.socket) -> None:
         self.children: list[Child] = []
         self.refuses: list[NotReady] = []
         self._make, self._stream = make, stream
@@ -127,17 +128,20 @@ class PlayedLauncher:
 class Scene:
     """A runner, its children, and the robot's end of the stream."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.path = path
         self.write('[robot]\nname = "r1"\n[device]\nprotocol = "tcpudp"\nconnect = ["tcp://127.0.0.1:1"]\n')
         file = check(path, path.read_bytes())
         assert file.fault is None
         self.stream, self.robot = socket.socketpair()
         self.robot.setblocking(False)
+        monkeypatch.setattr(module, "Launcher", self._launch)
         self.runner = Runner(file, None, verbose=False, changed=lambda: None)  # type: ignore[arg-type]
-        self.launcher = PlayedLauncher(self.runner._process, self.stream)
-        self.runner._launcher = self.runner._succession._launcher = self.launcher  # type: ignore[assignment]
         self._tasks = [asyncio.ensure_future(self.runner.run()), asyncio.ensure_future(self._reap())]
+
+    def _launch(self, _: object, make: Make, *, verbose: bool) -> PlayedLauncher:
+        self.launcher = PlayedLauncher(make, self.stream)
+        return self.launcher
 
     async def _reap(self) -> None:
         while True:
@@ -196,7 +200,7 @@ class Scene:
 async def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Scene]:
     for each in (duplicates, succession, module):
         monkeypatch.setattr(each, "PERIOD_S", 0.0)
-    made = Scene(tmp_path / "r1.toml")
+    made = Scene(tmp_path / "r1.toml", monkeypatch)
     yield made
     await made.close()
 
@@ -451,7 +455,7 @@ async def test_a_runner_without_free_descriptors_stops_the_robot_and_tries_again
     else:
         monkeypatch.setattr(socket, "socketpair", fail)
     first.dies()
-    await scene.until(lambda: scene.runner._next_at is not None)
+    await scene.until(lambda: scene.runner.snapshot.next_at is not None)
     monkeypatch.undo()
     assert scene.read() == 4 * b"stop."
     assert (await scene.child(1)).handover is None

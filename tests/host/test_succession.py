@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import socket
 from pathlib import Path
 from typing import Any
@@ -49,7 +50,7 @@ async def test_a_process_is_forked_with_its_file_its_post_and_what_it_takes_over
     assert forks.asked == [(Fork(str(path), "r1", True), b"as it was checked", 5, True)]
     pid, channel, of = started
     assert (pid, of) == (7, file)
-    assert channel._socket.recv(10) == b"here", "the far end is the process's"
+    assert os.read(channel.fileno(), 10) == b"here", "the far end is the process's"
     channel.close()
 
 

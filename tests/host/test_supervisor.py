@@ -12,10 +12,11 @@ import pytest
 
 from zbridge.errors import ConfigError
 from zbridge.host import supervisor as module
-from zbridge.host.files import Changes, RobotFile
+from zbridge.host.files import Changes, Follower, RobotFile
 from zbridge.host.replacement import VERSION, RunnerState
+from zbridge.host.runners import LATE_S, READY_S, STATUS_S, Reports, Runners
 from zbridge.host.settings import HostSettings
-from zbridge.host.supervisor import LATE_S, READY_S, STATUS_S, Supervisor
+from zbridge.host.supervisor import Supervisor
 from zbridge.host.watchdog import DRIVEN_S, EXTENSION_S, IDLE_S, Watchdog
 
 pytestmark = pytest.mark.jumping
@@ -50,7 +51,7 @@ class Process:
 class Runner:
     """Notes what it is told to do."""
 
-    def __init__(self, robot: RobotFile) -> None:
+    def __init__(self, robot: RobotFile, *_: object, **__: object) -> None:
         self.file = robot
         self.done: list[Any] = []
         self.state = "down"
@@ -102,37 +103,48 @@ class ForkClient:
 
 
 class Scene:
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, *, stagger_s: float = 0.0, watch: bool = False) -> None:
-        self.now = 100.0
-        clock = SimpleNamespace(monotonic=lambda: self.now, monotonic_ns=lambda: int(self.now * 1e9))
-        monkeypatch.setattr(module, "time", clock)
-        self.supervisor = Supervisor((), HostSettings(stagger_s=stagger_s), [], watch=watch, verbose=False)
-        self.supervisor._runner = Runner  # type: ignore[assignment, method-assign]
-        self.supervisor._forks, self.supervisor._code = ForkClient(), "one"  # type: ignore[assignment]
-        self.supervisor._systemd = self.systemd = Systemd()  # type: ignore[assignment]
+    """The runners of some files, and what systemd is told of them."""
+
+    def __init__(self, *, stagger_s: float = 0.0) -> None:
+        self.systemd = Systemd()
+        self.runners = Runners(Runner, self._changed, stagger_s=stagger_s)  # type: ignore[arg-type]
+        self.reports = Reports(self.systemd, self.runners)  # type: ignore[arg-type]
+
+    def _changed(self) -> None:
+        self.reports.changed()
 
     def runner(self, name: str) -> Any:
-        return self.supervisor._runners[Path(f"{name}.toml")]
+        return self.runners.by_path[Path(f"{name}.toml")]
 
-    async def apply(self, **changes: Any) -> None:
-        await self.supervisor._apply(Changes(**changes))
+    async def apply(self, *, first: bool = False, **changes: Any) -> None:
+        await self.runners.apply(Changes(**changes), first=first)
         await asyncio.sleep(0)
 
     def poll(self, now: float) -> float:
         """Check the watchdogs at this time; give when they are checked next."""
-        self.now = now
-        self.supervisor._check_watchdogs()
-        assert self.supervisor._timer is not None
-        self.supervisor._timer.cancel()
-        return self.supervisor._check_at
+        self.runners.check(now)
+        return self.runners.check_at
 
 
 @pytest.fixture
-async def scene(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Scene]:
-    made = Scene(monkeypatch)
+async def scene() -> AsyncIterator[Scene]:
+    made = Scene()
     yield made
-    if made.supervisor._status_timer is not None:
-        made.supervisor._status_timer.cancel()
+    made.reports.close()
+
+
+class Supervised(Scene):
+    """The same of a supervisor, at 100 s."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.systemd = Systemd()
+        clock = SimpleNamespace(monotonic=lambda: 100.0, monotonic_ns=lambda: 100_000_000_000)
+        monkeypatch.setattr(module, "time", clock)
+        monkeypatch.setattr(module, "Runner", Runner)
+        monkeypatch.setattr(module, "Systemd", lambda: self.systemd)
+        forks: Any = ForkClient()
+        self.supervisor = Supervisor((), HostSettings(), forks, watch=False, verbose=False)
+        self.runners = self.supervisor.runners
 
 
 # Files
@@ -145,7 +157,7 @@ async def test_robots_start_restart_and_end_with_their_files(scene: Scene) -> No
     await scene.apply(changed=(file("r1", b"other"),), gone=(Path("r2.toml"),))
     assert one.done == ["run", file("r1", b"other")]
     assert two.done == ["run", "end"]
-    assert list(scene.supervisor._runners) == [Path("r1.toml")]
+    assert list(scene.runners.by_path) == [Path("r1.toml")]
 
 
 async def test_a_file_that_is_renamed_keeps_its_runner(scene: Scene) -> None:
@@ -154,34 +166,34 @@ async def test_a_file_that_is_renamed_keeps_its_runner(scene: Scene) -> None:
     await scene.apply(moved=((Path("r1.toml"), renamed),))
     assert scene.runner("other") is before
     assert (before.file, before.done) == (renamed, ["run"])
-    assert len(scene.supervisor._runners) == 1
+    assert len(scene.runners.by_path) == 1
 
 
 async def test_faulty_files_are_counted_until_they_are_sound_or_gone(scene: Scene) -> None:
     await scene.apply(came=(file("r1"),))
     await scene.apply(faulty=(file("r1", fault="colour"), file("r2", fault="taste"), file("r3", fault="smell")))
-    assert scene.supervisor.status == "1 robots, 1 down, 3 faulty files"
+    assert scene.runners.status == "1 robots, 1 down, 3 faulty files"
     assert scene.runner("r1").done == ["run"], "its robot continues as before"
     await scene.apply(changed=(file("r1"),), came=(file("r2"),))
-    assert scene.supervisor.status == "2 robots, 2 down, 1 faulty files"
+    assert scene.runners.status == "2 robots, 2 down, 1 faulty files"
 
 
 @pytest.mark.parametrize("stagger_s", [0.0, 10.0])
-async def test_robots_start_one_after_the_other(monkeypatch: pytest.MonkeyPatch, stagger_s: float) -> None:
-    scene, loop = Scene(monkeypatch, stagger_s=stagger_s), asyncio.get_running_loop()
+async def test_robots_start_one_after_the_other(stagger_s: float) -> None:
+    scene, loop = Scene(stagger_s=stagger_s), asyncio.get_running_loop()
     began = loop.time()
     await scene.apply(came=(file("r1"),))
     assert loop.time() == began, "the first one at once"
     await scene.apply(came=(file("r2"), file("r3"), file("r4")))
     assert 2 * 0.5 * stagger_s <= loop.time() - began <= 2 * 1.5 * stagger_s
+    scene.reports.close()
 
 
-async def test_files_are_read_again_at_sighup_and_systemd_is_told(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_files_are_read_again_at_sighup_and_systemd_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = Supervised(monkeypatch)
     looks: list[bool] = []
 
-    def poll(running: dict[Path, RobotFile], *, twice: bool) -> Changes:
+    def poll(_: Follower, running: dict[Path, RobotFile], *, twice: bool) -> Changes:
         looks.append(twice)
         if len(looks) > 1:
             raise ConfigError("two files name one robot")
@@ -190,19 +202,19 @@ async def test_files_are_read_again_at_sighup_and_systemd_is_told(
     async def inline(work: Any, *arguments: Any, **named: Any) -> Any:
         return work(*arguments, **named)
 
-    monkeypatch.setattr(scene.supervisor._follower, "poll", poll)
+    monkeypatch.setattr(Follower, "poll", poll)
     monkeypatch.setattr(asyncio, "to_thread", inline)
-    following = asyncio.ensure_future(scene.supervisor._follow())
+    following = asyncio.ensure_future(scene.supervisor.follow())
     await asyncio.sleep(100.0)
     assert (looks, scene.systemd.told) == ([], []), "nobody asked"
     for count in (1, 2):
         scene.systemd.told.clear()
-        scene.supervisor._reload.set()
+        scene.supervisor.reload()
         await asyncio.sleep(0.001)
         assert looks == [False] * count
         told = [each for each in scene.systemd.told if not each.startswith("STATUS")]
         assert told == ["RELOADING=1", "MONOTONIC_USEC=100000000", "READY=1"]
-    assert list(scene.supervisor._runners) == [Path("r1.toml")]
+    assert list(scene.runners.by_path) == [Path("r1.toml")]
     following.cancel()
     await asyncio.wait([following])
 
@@ -222,7 +234,7 @@ async def test_a_process_that_is_silent_for_too_long_is_killed_and_the_next_dead
     driven.over.set_result(9)
     assert scene.poll(101.0) == 102.0, "once a second at least"
     assert idle.killed == []
-    scene.supervisor._check_at = 100.0 + IDLE_S
+    scene.runners.check_at = 100.0 + IDLE_S
     scene.poll(100.0 + IDLE_S)
     assert (len(driven.killed), len(idle.killed)) == (1, 1)
 
@@ -232,7 +244,7 @@ async def test_what_a_process_told_before_it_is_looked_at_counts(scene: Scene) -
     scene.runner("r1").process = process = Process()
     process.watchdog.heartbeat(100.0, driven=True)
     process.heartbeats, process.now = True, 100.0 + DRIVEN_S
-    scene.supervisor._check_at = 100.0 + DRIVEN_S
+    scene.runners.check_at = 100.0 + DRIVEN_S
     scene.poll(100.0 + DRIVEN_S)
     assert process.killed == []
 
@@ -247,7 +259,7 @@ async def test_a_supervisor_that_was_held_up_itself_waits_a_little_longer(
     await scene.apply(came=(file("r1"),))
     scene.runner("r1").process = process = Process()
     process.watchdog.heartbeat(100.0, driven=True)
-    scene.supervisor._check_at = 100.0 + DRIVEN_S
+    scene.runners.check_at = 100.0 + DRIVEN_S
     scene.poll(100.0 + DRIVEN_S + late_s)
     assert bool(process.killed) is killed
 
@@ -259,44 +271,42 @@ async def test_a_process_of_a_robot_whose_file_is_gone_is_watched_until_it_has_e
     runner.goes.clear()
     await scene.apply(gone=(Path("r1.toml"),))
     process.watchdog.heartbeat(100.0, driven=True)
-    scene.supervisor._check_at = 101.0
+    scene.runners.check_at = 101.0
     scene.poll(101.0)
     assert process.killed
-    assert scene.supervisor._snapshot() is None
     runner.goes.set()
     await asyncio.sleep(0.001)
-    assert list(scene.supervisor._processes()) == []
+    assert scene.runners.processes == ()
 
 
 # The status line, and systemd
 
 
 async def test_the_status_counts_robots_by_state_restarts_and_faults(scene: Scene) -> None:
-    assert scene.supervisor.status == "0 robots"
+    assert scene.runners.status == "0 robots"
     await scene.apply(came=(file("r1"), file("r2"), file("r3")), faulty=(file("r4", fault="colour"),))
     scene.runner("r1").state = scene.runner("r2").state = "established"
     scene.runner("r1").restarts, scene.runner("r3").restarts = 2, 3
-    assert scene.supervisor.status == "3 robots, 1 down, 2 established, 5 restarts, 1 faulty files"
+    assert scene.runners.status == "3 robots, 1 down, 2 established, 5 restarts, 1 faulty files"
 
 
 async def test_the_service_is_ready_once_when_every_gateway_has_beaten(scene: Scene) -> None:
-    await scene.apply(came=(file("r1"), file("r2")))
-    scene.supervisor._all_started = True
+    await scene.apply(came=(file("r1"), file("r2")), first=True)
     for name in ("r1", "r2"):
-        scene.supervisor._state_changed()
+        scene.reports.changed()
         await asyncio.sleep(READY_S + 0.01)
         assert "READY=1" not in scene.systemd.told
         scene.runner(name).process = Process()
         scene.runner(name).process.watchdog.heartbeat(0.0, driven=False)
     scene.systemd.hears = False
-    scene.supervisor._state_changed()
+    scene.reports.changed()
     await asyncio.sleep(READY_S + 0.01)
-    assert not scene.supervisor._is_ready, "systemd has not heard it"
+    assert not scene.reports.is_ready, "systemd has not heard it"
     scene.systemd.hears = True
     await asyncio.sleep(READY_S + 0.01)
     assert scene.systemd.told.count("READY=1") == 1
-    scene.supervisor._state_changed()
-    scene.supervisor._state_changed()
+    scene.reports.changed()
+    scene.reports.changed()
     told = len(scene.systemd.told)
     await asyncio.sleep(READY_S + 0.01)
     assert len(scene.systemd.told) == told
@@ -305,16 +315,16 @@ async def test_the_service_is_ready_once_when_every_gateway_has_beaten(scene: Sc
 
 
 async def test_a_service_whose_robots_are_not_all_started_is_not_ready(scene: Scene) -> None:
-    scene.supervisor._state_changed()
+    scene.reports.changed()
     await asyncio.sleep(READY_S + 0.01)
     assert scene.systemd.told == ["STATUS=0 robots"]
 
 
 async def test_the_watchdog_of_systemd_is_fed_where_there_is_one(scene: Scene) -> None:
-    await scene.supervisor._live()
+    await scene.reports.live()
     assert scene.systemd.told == []
     scene.systemd.watchdog_s = 15.0
-    living = asyncio.ensure_future(scene.supervisor._live())
+    living = asyncio.ensure_future(scene.reports.live())
     await asyncio.sleep(31.0)
     assert scene.systemd.told == ["WATCHDOG=1"] * 3
     living.cancel()
@@ -324,17 +334,27 @@ async def test_the_watchdog_of_systemd_is_fed_where_there_is_one(scene: Scene) -
 # Its own code
 
 
-async def test_everything_is_kept_for_the_code_in_its_place_when_nothing_is_under_way(scene: Scene) -> None:
-    await scene.apply(came=(file("r1", b"one"),), faulty=(file("r2", fault="colour"), file("\udcff", fault="name")))
+async def test_everything_is_kept_for_the_code_in_its_place_when_nothing_is_under_way(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scene = Supervised(monkeypatch)
     supervisor = scene.supervisor
-    assert supervisor._snapshot() is None, "not all have started"
-    supervisor._all_started = True
-    state = supervisor._snapshot()
+    await scene.apply(came=(file("r1", b"one"), file("r3")))
+    assert supervisor.snapshot() is None, "not all have started"
+    faulty = (file("r2", fault="colour"), file("\udcff", fault="name"))
+    scene.runner("r3").goes.clear()
+    leaving = scene.runner("r3")
+    await scene.apply(faulty=faulty, gone=(Path("r3.toml"),), first=True)
+    assert supervisor.snapshot() is None, "one is still ending"
+    leaving.goes.set()
+    await asyncio.sleep(0.001)
+    state = supervisor.snapshot()
     assert state is not None
     assert (state.version, state.at, state.leaving) == (VERSION, 100.0, (7,))
     assert [(each.path, each.content) for each in state.runners] == [("r1.toml", b"one")]
     assert state.faults == {"r2.toml": "colour"}, "a name that cannot be written is looked at anew"
     scene.runner("r1").is_idle = False
-    assert supervisor._snapshot() is None
-    scene.runner("r1").is_idle, supervisor._ends = True, True
-    assert supervisor._snapshot() is None
+    assert supervisor.snapshot() is None
+    scene.runner("r1").is_idle = True
+    await scene.runners.end()
+    assert supervisor.snapshot() is None

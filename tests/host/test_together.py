@@ -39,7 +39,7 @@ class Played:
         self.buses: dict[str, Bus] = {}
 
     async def run_on(self, gateway: Gateway, bus: Bus, neighbourhood: Neighbourhood) -> None:
-        name, loop = gateway._plan.config.robot.name, asyncio.get_running_loop()
+        name, loop = repr(gateway).removeprefix("<Gateway ").removesuffix(">"), asyncio.get_running_loop()
         self.begun.append((name, loop.time()))
         self.buses[name] = bus
         self.parts.add(neighbourhood.part)

@@ -357,7 +357,7 @@ LOOKS: dict[str, Callable[[Scene], str]] = {
     "asked": lambda scene: spelled(*scene.gateway.asked),
     "stops": lambda scene: spelled(len(scene.bus.values("fleet/r1/@cmd/stop"))),
     "encoded": lambda scene: spelled(scene.side.encoded),
-    "tokens": lambda scene: spelled(*(key.removeprefix(KEYS.alive("")) for key in scene.bus._shared.tokens)),
+    "tokens": lambda scene: spelled(*(key.removeprefix(KEYS.alive("")) for key in scene.bus.network.tokens)),
     "active": lambda scene: spelled(*(client.number for client in scene.listener._active)),
     **{what: lambda scene, name=f"hq_{what}": spelled(scene.count(name)) for what in COUNTS},
     "sessions": lambda scene: spelled(*(client.session.state.value for client in scene.listener.clients.values())),

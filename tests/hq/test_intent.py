@@ -191,10 +191,10 @@ def test_whatever_is_said_in_any_order_nothing_moves_that_owes_neutral(steps: li
             intent.granted(LEASE_S)
         elif step == "lose" and (intent.asking or intent.held):
             intent.lost("stop")
-            owes = True
+            owes, overtaken = True, -math.inf
         elif step == "refuse":
             intent.refused("busy: map")
-            owes = True
+            owes, overtaken = True, -math.inf
         elif step in SAID:
             modeless = step == "motion" and intent.mode == "none"
             try:
@@ -207,12 +207,11 @@ def test_whatever_is_said_in_any_order_nothing_moves_that_owes_neutral(steps: li
             if step in ("mode manual", "mode autonomous") and now < overtaken:
                 owes = False
             assert not (owes and step in ("motion", "mode autonomous")), "it moves"
-            owes = owes and step != "neutral"
+            owes, overtaken = (False, -math.inf) if step == "neutral" else (owes, overtaken)
             moving_until = now + DEADMAN_S if step == "motion" else moving_until
             moving_until = math.inf if owes or step in ("neutral", "mode none") else moving_until
             if done is Action.RELEASE:
                 intent.released()
-        overtaken = -math.inf if step in ("lose", "refuse", "neutral") else overtaken
         assert not (intent.held and intent.asking)
 
 

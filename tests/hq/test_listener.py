@@ -10,6 +10,7 @@ import weakref
 
 import pytest
 
+from tests.bounds import most_kept
 from tests.hq.scene import KEYS, Program, Scene, ToySession, ToySide, play, serving, soon
 from tests.hq.scripts import scripts
 from zbridge.protocol.address import Address
@@ -109,7 +110,7 @@ async def test_a_flood_of_connections_costs_a_few_lines_a_second(accept_hz, capl
 @pytest.mark.scene(accept_hz=1000)
 async def test_many_clients_come_and_go_and_leave_nothing_behind(scene: Scene) -> None:
     await soon()
-    tasks, kept = len(asyncio.all_tasks()), scene.bus._shared
+    tasks, kept, most = len(asyncio.all_tasks()), scene.bus.network, most_kept(scene.listener)
     subscribers, queryables = len(kept.subscribers), len(kept.queryables)
     sessions: list[weakref.ref[ToySession]] = []
     for cycle in range(500):
@@ -130,8 +131,7 @@ async def test_many_clients_come_and_go_and_leave_nothing_behind(scene: Scene) -
     assert (len(kept.subscribers), len(kept.queryables)) == (subscribers, queryables)
     assert kept.tokens == [KEYS.alive("gateway")]
     assert repr(scene.manager) == "<SessionTable 0 live, 32 ended>"
-    assert len(scene.listener._context.bridge._publishers) <= 2
-    assert (scene.listener._active, len(scene.listener._queries)) == (set(), 0)
+    assert most_kept(scene.listener) == most
     assert "0 of 254 taken" in repr(scene.listener._numbers)
     assert scene.gateway.report().state == "free"
     scene.side.made.clear()
@@ -172,7 +172,7 @@ async def test_an_ending_listener_takes_leave_of_all_and_gives_the_robot_back() 
     assert all(program.link.closed for program in scene.programs.values())
     assert {shown.reason for shown in scene.manager.snapshots()} == {"gateway stopped"}
     assert scene.gateway.report().state == "free"
-    assert scene.bus._shared.tokens == [KEYS.alive("gateway")]
+    assert scene.bus.network.tokens == [KEYS.alive("gateway")]
     await soon()
     assert scene.listener.clients == {}
     assert len(asyncio.all_tasks()) == 1

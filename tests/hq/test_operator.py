@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 import pytest
 
+from tests.bounds import most_kept
 from tests.hq.gateway import KEYS, Gateway
 from tests.hq.scripts import scripts
 from zbridge.bus.fake import FakeBus
@@ -241,7 +242,7 @@ LOOKS: dict[str, Callable[[Scene], str]] = {
     "holder": lambda scene: scene.gateway.report().holder or NOTHING,
     "held": lambda scene: str(scene.program.intent.held),
     "active": lambda scene: str(scene.program.active),
-    "tokens": lambda scene: " ".join(key.removeprefix(KEYS.alive("")) for key in scene.bus._shared.tokens) or NOTHING,
+    "tokens": lambda scene: " ".join(key.removeprefix(KEYS.alive("")) for key in scene.bus.network.tokens) or NOTHING,
     "violations": lambda scene: " ".join(scene.gateway.refused) or NOTHING,
 }
 
@@ -429,6 +430,6 @@ async def test_many_programs_and_keys_leave_nothing(scene: Scene) -> None:
         await scene.play(f"program {number}; {DRIVES}; close; done -> nothing; tokens nothing")
     for number in range(2 * PUBLISHERS):
         scene.bridge.put(topics.CMD_SENSOR(f"s{number}"), SensorSetting(value=1.0))
-    assert len(scene.bridge._publishers) == PUBLISHERS
+    assert most_kept(scene.bridge) == PUBLISHERS
     assert len(scene.bus.values("fleet/r1/@cmd/sensor/*")) == 2 * PUBLISHERS
     scene.bridge.close()

@@ -2,6 +2,7 @@
 
 import pytest
 
+from tests.bounds import most_kept
 from zbridge.bus.fake import FakeBus
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -46,7 +47,7 @@ class Scene:
 
     @property
     def subscribed(self) -> list[str]:
-        return sorted(KEYS.path(key) for key, _ in self.bus._shared.subscribers)
+        return sorted(KEYS.path(key) for key, _ in self.bus.network.subscribers)
 
 
 @pytest.fixture
@@ -152,5 +153,4 @@ def test_names_that_a_robot_makes_up_for_ever_are_not_all_remembered(scene: Scen
     for number in range(3000):
         scene.say(topics.SENSOR(f"s{number}"), Reading(value=1.0))
     assert len(follower.heard) == 3000
-    assert len(scene.audience._topics) <= 1024
-    assert KEYS.key("sensor/s2999") in scene.audience._topics, "and the newest are known"
+    assert most_kept(scene.audience) <= 1024

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.bounds import most_kept
 from tests.proofs import packed, proof, shown
 from zbridge.errors import Malformed, PayloadError
 from zbridge.fleet.messages import Authorization, Lease
@@ -161,4 +162,4 @@ def test_what_was_proven_is_noted_once_and_only_as_it_was_and_notes_are_bounded(
     assert verifier.noted(ATTACHMENT, DRIVE, PAYLOAD) is None
     for number in range(3 * NOTES):
         verifier.note(number.to_bytes(4, "big"), said, DRIVE, PAYLOAD)
-    assert len(verifier._notes) <= NOTES
+    assert most_kept(verifier) <= NOTES

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.bounds import most_kept
 from zbridge.protocol.device_clock import BUCKETS, DeviceClock
 
 EPOCH_NS = 1_700_000_000_000_000_000
@@ -177,7 +178,7 @@ def test_stamps_go_on_at_half_the_pace_at_least_and_equal_counters_have_equal_st
             assert stamp_ns == last_ns
         else:
             assert stamp_ns >= min(last_ns + step_ms * MS // 2, arrived_ns)
-        assert len(clock._points) <= BUCKETS
+        assert most_kept(clock) <= BUCKETS
         last_ns = stamp_ns
 
 

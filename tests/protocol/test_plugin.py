@@ -11,10 +11,10 @@ from tests.protocol.test_session import LIMITS, Toy
 from zbridge.errors import ConfigError
 from zbridge.fleet import topics
 from zbridge.metrics import Metrics
-from zbridge.protocol.plugin import GROUP, Protocol, Robot, find_protocol, protocol_names
+from zbridge.protocol.plugin import GROUP, Protocol, RobotSide, find_protocol, protocol_names
 
 
-class ToyRobot(Robot):
+class ToyRobot(RobotSide):
     link_names = ("robot",)
     driving: Toy | None = None
     session = translator = command = stop = ask = None

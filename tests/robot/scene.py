@@ -152,7 +152,7 @@ class Program:
     def command(self, name: str, fields: dict[str, Any] | bytes = NEUTRAL) -> None:
         """Command the robot, with the lease where there is one and the command needs it."""
         payload = fields if isinstance(fields, bytes) else packed(fields)
-        needed = name.split("/")[0] in NEED_A_LEASE
+        needed = name.split("/", maxsplit=1)[0] in NEED_A_LEASE
         self.put(name, payload, self.held.attachment(name, payload) if needed and self.held is not None else None)
 
     def put(self, name: str, fields: dict[str, Any] | bytes, attachment: bytes | None) -> None:
@@ -200,7 +200,7 @@ class Rig:
         self.driver, self.other = Program(self, "driver"), Program(self, "other")
         self.hold = self.driver.acquire
         self.command = self.driver.command
-        self._read = 0
+        self.read_to = 0
 
     async def _connect(self, address: Address, conversation: Conversation) -> None:
         assert address == ADDRESS
@@ -253,11 +253,11 @@ class Rig:
         return self.values(path)[-1]
 
     def forget_written(self) -> None:
-        self._read = len(self.link.written)
+        self.read_to = len(self.link.written)
 
     def written(self) -> list[bytes]:
         """What was written since this was asked last."""
-        start, self._read = self._read, len(self.link.written)
+        start, self.read_to = self.read_to, len(self.link.written)
         return self.link.written[start:]
 
     @property

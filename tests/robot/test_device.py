@@ -379,7 +379,7 @@ async def test_the_robot_gets_what_it_should(script: str) -> None:
 async def test_a_stop_stops_the_robot_whatever_its_payload_and_alone_may_have_wildcards(rig: Rig, key, payload) -> None:
     """Who subscribed to what a key expression meets is found by Zenoh's own rules."""
     await rig.play("left 0.1 > left")
-    for subscribed, take in rig.bus._shared.subscribers:
+    for subscribed, take in rig.bus.network.subscribers:
         if zenoh.KeyExpr(subscribed).intersects(zenoh.KeyExpr(key)):
             take(Sample(key, payload))
     await rig.play("0 > stop\n control stopped\n refused")
@@ -415,7 +415,7 @@ async def test_whoever_acquires_is_given_the_lease_and_shown_as_the_holder_but_t
     assert rig.driver.renew()["expires_in_s"] == 3.0
     await rig.play("left > left\n stop")
     assert not any(token in payload for payload in rig.bus.values("fleet/r1/*"))
-    assert not any(token in (sample.attachment or b"") for sample in rig.bus._shared.history)
+    assert not any(token in (sample.attachment or b"") for sample in rig.bus.network.history)
 
 
 @pytest.mark.scene(deadman_s=60.0, hold=False)
@@ -727,7 +727,7 @@ def raise_key_error(*arguments: object) -> None:
 
 
 KEY_ERROR = r"a fault of the protocol: KeyError: 1 in \S+ \(test_device.py:\d+\)"
-NO_OUTCOME = r"a fault of the protocol: TypeError: Robot.command gave no Outcome in \S+ \(commands.py:\d+\)"
+NO_OUTCOME = r"a fault of the protocol: TypeError: RobotSide.command gave no Outcome in \S+ \(commands.py:\d+\)"
 
 
 @pytest.mark.parametrize(

@@ -116,7 +116,7 @@ async def test_a_second_gateway_waits_until_the_first_goes_and_says_so_once(capl
 
 @pytest.mark.parametrize("zids", [("1", "2"), ("b", "a")])
 async def test_of_two_that_start_at_the_same_moment_the_lower_id_goes_on(zids: tuple[str, str]) -> None:
-    shared = FakeBus()._shared
+    shared = FakeBus().network
     claims = {zid: Ownership(Distant(zid, shared), KEYS) for zid in zids}
     takes = {zid: asyncio.create_task(claim.take()) for zid, claim in claims.items()}
     await asyncio.sleep(5.0)
@@ -130,7 +130,7 @@ async def test_of_two_that_start_at_the_same_moment_the_lower_id_goes_on(zids: t
 async def test_of_those_that_start_together_one_goes_on(count: int) -> None:
     settled = []
     for seed in range(20):
-        rng, shared = random.Random(seed), FakeBus()._shared
+        rng, shared = random.Random(seed), FakeBus().network
         takes = []
         for number in range(count):
             bus = Distant(str(number), shared)
@@ -145,7 +145,7 @@ async def test_of_those_that_start_together_one_goes_on(count: int) -> None:
 async def test_one_that_holds_the_robot_is_not_driven_out_by_a_lower_id_that_does_not_see_its_token() -> None:
     bus = FakeBus("9")
     await owned(bus)
-    bus._shared.tokens.remove(TOKEN)
+    bus.network.tokens.remove(TOKEN)
     await kept_waiting(bus.join("1"))
 
 
@@ -278,7 +278,7 @@ async def test_a_gateway_that_does_not_answer_at_once_is_waited_for() -> None:
 
     bus = FakeBus("1")
     await owned(bus)
-    await kept_waiting(Silent("0", bus._shared))
+    await kept_waiting(Silent("0", bus.network))
 
 
 # Two that serve one robot
@@ -308,9 +308,9 @@ class Two:
     def heal(self, *, noticed: bool) -> None:
         """Join the two networks; noticed: both sessions have lost their bus, and find it again now."""
         one, other = self.buses
-        one._shared.queryables += other._shared.queryables
-        one._shared.tokens += other._shared.tokens
-        other._shared = one._shared
+        one.network.queryables += other.network.queryables
+        one.network.tokens += other.network.tokens
+        other.network = one.network
         if noticed:
             for up in (False, True):
                 for bus in self.buses:
@@ -361,7 +361,7 @@ async def test_of_two_that_meet_exactly_one_serves_within_2_s(
         assert two.robots[winner].rivals[-1] == {two.buses[loser].zid}
     else:
         assert (two.robots[loser].turns, two.watching[loser].done()) == ([], True)
-    assert two.buses[0]._shared.tokens == [TOKEN]
+    assert two.buses[0].network.tokens == [TOKEN]
 
 
 @pytest.mark.parametrize("seed", range(50))

@@ -146,7 +146,9 @@ def test_a_router_without_ports_has_no_rules() -> None:
 @pytest.mark.parametrize(("listen", "ports"), PORTS)
 def test_nft_takes_the_rules(listen: tuple[str, ...], ports: dict[str, str], tmp_path: Path) -> None:
     (tmp_path / "router.nft").write_text(nftables(RouterSettings(listen=listen)))
-    checked = subprocess.run(["nft", "-c", "-f", str(tmp_path / "router.nft")], capture_output=True, text=True)
+    checked = subprocess.run(
+        ["nft", "-c", "-f", str(tmp_path / "router.nft")], capture_output=True, text=True, check=False
+    )
     if "not permitted" in checked.stderr:
         pytest.skip("nft needs the right to see the kernel's tables")
     assert checked.returncode == 0, checked.stderr

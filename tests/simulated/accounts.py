@@ -13,6 +13,8 @@ TOLERANCE = {"tcpudp": 1e-6, "alf": 0.0051, "wc2ec": 1e-6}
 """By how much a value at the robot may differ from the one that was given, fractions of full scale."""
 MAX_AGE_S = 0.4
 """Seconds after which a dated command is stale, unless the deadman is less."""
+SLACK_S = 0.06
+"""What is on its way through a gateway when a lease ends may be written so long."""
 WHEEL_FULL = 10.0
 """rad/s of a wheel at full scale, as the scenarios configure it."""
 
@@ -124,6 +126,32 @@ class Grant:
             command.forbidden = "neutral first"
         else:
             self.last_motion = command
+
+
+def fault_of(command: Command, grant: Grant | None, gateway: str, now: float) -> tuple[str, str] | None:
+    """Return the rule that motion breaks which a gateway writes now, and how; None where this command allows it."""
+    received = command.received[gateway]
+    if grant is None or grant.gateway != gateway:
+        return "no-lease", "without a lease of this gateway"
+    if command.who != grant.asker:
+        return "forged", f"{command.who} used the lease of {grant.asker}"
+    if grant.over(now, SLACK_S):
+        return "lease-ended", f"its lease ended {now - (grant.ended_at or 0):.2f} s ago: {grant.why}"
+    if received < grant.at:
+        return "no-lease", "received before its lease"
+    if command.forbidden:
+        return "neutral-first", "after the deadman, without a neutral"
+    late_s = received - command.given_at - grant.base_s
+    if command.dated and late_s > min(MAX_AGE_S, grant.deadman_s) + 0.05:
+        return "stale", f"it came {late_s:.2f} s late"
+    if command.called_off is not None and now > command.called_off + SLACK_S:
+        return "called-off", f"it was called off {now - command.called_off:.2f} s ago"
+    if command.kind == "mode":
+        return ("stale", "long ago") if now - received > 2.5 else None
+    given_at = command.given_at + grant.base_s if command.dated else received
+    if now - given_at > grant.deadman_s + 0.1:
+        return "deadman", f"given {now - given_at:.2f} s ago, deadman {grant.deadman_s:g} s"
+    return None
 
 
 def read(payload: bytes | None) -> dict[str, Any]:

@@ -425,6 +425,7 @@ class SimQuery:
         self.replied = True
         asker = self._asked.bus.session.process.name
         world = self._session.fabric.world
-        world.note(self._session.process.name, "answers", self.asked, answer.payload, str(answer.error), asker)
+        said = (self.asked, answer.payload, str(answer.error), asker, self.payload)
+        world.note(self._session.process.name, "answers", *said)
         self._asked.reply(self._session, msgspec.structs.replace(answer))
         self.ends()

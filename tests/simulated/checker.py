@@ -10,17 +10,17 @@ from __future__ import annotations
 from collections import Counter, defaultdict, deque
 from typing import TYPE_CHECKING, Any
 
-from tests.simulated.accounts import MAX_AGE_S, TOLERANCE, Command, Grant, motions, read
+from tests.simulated.accounts import SLACK_S, TOLERANCE, Command, Grant, fault_of, motions, read
+from tests.simulated.fleet import FleetRules
 from tests.simulated.obligations import LEFT, Obligations
 from tests.simulated.released import Released
 from tests.simulated.shown import Shown
+from tests.simulated.stops import StopRules
 from tests.simulated.written import Written
 
 if TYPE_CHECKING:
     from tests.simulated.scenario import Simulation
 
-SLACK_S = 0.06
-"""What is on its way through a gateway when a lease ends may be written so long."""
 NEW = "+"
 """Behind the name of a gateway's successor, until *go*."""
 WRITTEN_S = 0.02
@@ -55,7 +55,8 @@ class Checker:
         """By gateway, the latched stops that a successor received."""
         self.gateways = {each.name: each for each in simulation.gateways}
         self.by_host = {each.host.name: each.name for each in simulation.gateways if each.serves}
-        self._requests: dict[tuple[str, str], dict[str, Any]] = {}
+        self._requests: dict[tuple[str, str, bytes], dict[str, Any]] = {}
+        """By program, key and payload: several may come at once, after a cut."""
         self._commands: dict[tuple[str, bytes, bytes], Command] = {}
         self._recent: dict[str, deque[Command]] = {name: deque(maxlen=600) for name in self.gateways}
         self._gives: dict[str, deque[tuple[float, float]]] = {
@@ -83,11 +84,11 @@ class Checker:
             "ended": self._on_ended,
             "was suspended": self._on_suspended,
             "gives": self._on_gives,
-            "crashed": self._on_crashed,
+            "crashed": lambda who, why: self.violate("fragile", f"{who} crashed: {why}"),
         }
         self.obligations = Obligations(self)
-        self.written, self.released = Written(self), Released(self)
-        self.rules = (self.written, self.released, Shown(self))
+        self.written, self.released, self.stops = Written(self), Released(self), StopRules(self)
+        self.rules = (self.written, self.released, self.stops, FleetRules(self), Shown(self))
         self.know_mode: set[str] = set()
         """The gateways that know that the robot was told to move by itself."""
         self._mode_at = 0.0
@@ -113,17 +114,19 @@ class Checker:
 
     def _on_asks(self, who: str, key: str, payload: bytes) -> None:
         if "@rpc/control/" in key:
-            self._requests[who, key] = {**read(payload), "asked at": self.world.now}
+            self._requests[who, key, payload] = {**read(payload), "asked at": self.world.now}
 
-    def _on_answers(self, gateway: str, key: str, payload: bytes, error: str, asker: str) -> None:
+    def _on_answers(self, gateway: str, key: str, payload: bytes, error: str, asker: str, asked: bytes) -> None:
         verb = key.partition("@rpc/control/")[2].partition("/")[0]
         if not verb or error != "None" or gateway not in self.gateways:
             return
-        answer, request = read(payload), self._requests.get((asker, key), {})
+        answer, request = read(payload), self._requests.get((asker, key, asked), {})
         self.counts[f"{verb} {'ok' if answer.get('ok', True) else answer.get('code')}"] += 1
         if verb.startswith("unlatch"):
-            for known in self.latches.values():
-                known.pop(request.get("id", b""), None)
+            stop_id = request.get("id", b"")
+            for name, known in self.latches.items():
+                if known.pop(stop_id, None) is not None and name != gateway:
+                    self.uncertain.add(stop_id)  # that gateway has still to learn of it
         elif answer.get("ok") and verb in ("acquire", "takeover"):
             grant, last = Grant(gateway, asker, answer, request, self.world.now), self.current.get(gateway)
             stands = last is not None and last.ended_at is None and last.shown and not last.expires_by(self.world.now)
@@ -333,6 +336,7 @@ class Checker:
 
     def _written(self, gateway: str, data: bytes) -> None:
         self.written.written(gateway, data)
+        self.stops.written(gateway, data)
         for kind, value in motions(self.protocol, data):
             if kind == "mode" and value != 3.0:
                 continue
@@ -360,39 +364,11 @@ class Checker:
                 break
             if (command.kind == "mode") is not (kind == "mode") or abs(command.value - value) > tolerance:
                 continue
-            reason = self._fault_of(command, gateway)
+            reason = fault_of(command, self.grants.get(command.lease or b""), gateway, now)
             if reason is None:
                 return None
             worst = worst or (reason[0], f"{gateway} wrote {command}: {reason[1]}")
         return worst or ("unknown-motion", f"{gateway} wrote {kind} {value:.5f}, which nobody commanded")
-
-    def _fault_of(self, command: Command, gateway: str) -> tuple[str, str] | None:
-        now, received = self.world.now, command.received[gateway]
-        grant = self.grants.get(command.lease or b"")
-        if grant is None or grant.gateway != gateway:
-            return "no-lease", "without a lease of this gateway"
-        if command.who != grant.asker:
-            return "forged", f"{command.who} used the lease of {grant.asker}"
-        if grant.over(now, SLACK_S):
-            return "lease-ended", f"its lease ended {now - (grant.ended_at or 0):.2f} s ago: {grant.why}"
-        if received < grant.at:
-            return "no-lease", "received before its lease"
-        if command.forbidden:
-            return "neutral-first", "after the deadman, without a neutral"
-        late_s = received - command.given_at - grant.base_s
-        if command.dated and late_s > min(MAX_AGE_S, grant.deadman_s) + 0.05:
-            return "stale", f"it came {late_s:.2f} s late"
-        if command.called_off is not None and now > command.called_off + SLACK_S:
-            return "called-off", f"it was called off {now - command.called_off:.2f} s ago"
-        if command.kind == "mode":
-            return ("stale", "long ago") if now - received > 2.5 else None
-        given_at = command.given_at + grant.base_s if command.dated else received
-        if now - given_at > grant.deadman_s + 0.1:
-            return "deadman", f"given {now - given_at:.2f} s ago, deadman {grant.deadman_s:g} s"
-        return None
-
-    def _on_crashed(self, who: str, why: str) -> None:
-        self.violate("fragile", f"{who} crashed: {why}")
 
     # The end
 

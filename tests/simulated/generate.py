@@ -12,10 +12,10 @@ from typing import Any
 from tests.simulated.faults import REACHED
 from tests.simulated.generate_restarts import restarts
 from tests.simulated.situations import arrange
+from tests.simulated.steps import WHEELS
 
 PROFILES = ("link", "bus", "ownership", "hq", "restart", "latch", "tcpudp", "alf", "wc2ec", "mixed", "situations")
 SECONDS = (25.0, 60.0)
-_WHEELS = {"differential": {"left": ["left"], "right": ["right"], "wheel_radius_m": 0.05, "track_m": 0.3}}
 _STATES = tuple(REACHED)
 _WITH_PROGRAMS = ("mixed", "link", "latch", "restart", "tcpudp", "alf", "wc2ec")
 _DRIVEN = ("moving", "moving", "mode read", "drive received", "stopping", "stop unwritten")
@@ -73,7 +73,7 @@ def _robot(rng: random.Random, protocol: str, *, stripped: bool) -> dict[str, An
     elif protocol == "alf":
         options["dialect"] = device["dialect"] = rng.choice(("text", "binary"))
     else:
-        device = _WHEELS
+        device = WHEELS
     return {"protocol": protocol, "options": options, "device": device}
 
 

@@ -14,12 +14,14 @@ import msgpack
 from tests.simulated.bus import Fabric, SimSession
 from tests.simulated.bus_session import SimBus
 from tests.simulated.engine import Host, Process, SimLoop
+from tests.simulated.hq_programs import WHEEL_FULL
 from tests.simulated.net import Network
 from zbridge.client.fleet import Fleet
 from zbridge.errors import Held, LeaseLost, NeutralFirst, Refused, ZbridgeError
 from zbridge.metrics import Metrics
 
 ROBOT = "r1"
+_NOTHING = object()
 RESTART_S = 10.0
 """Longest wait for the answer to a restart."""
 
@@ -182,8 +184,11 @@ class DriverMember(Member):
         robot = fleet[ROBOT]
         if step["do"] == "stop":
             await robot.stop()
+        elif step["do"] == "latch" and step.get("fleet"):
+            if (await fleet.latch()).get(ROBOT, _NOTHING) is not None:
+                return
         elif step["do"] == "latch":
-            await (fleet.latch() if step.get("fleet") else robot.latch())
+            await robot.latch()
         elif step["do"] == "unlatch":
             await (fleet.unlatch() if step.get("fleet") else robot.unlatch())
         elif step["do"] == "restart":
@@ -240,12 +245,13 @@ class DriverMember(Member):
 
     async def _give(self, drive: Any, step: dict[str, Any], ends_at: float, hz: float) -> None:
         loop = asyncio.get_running_loop()
+        begins_at = loop.time() + step.get("quiet", 0.0)
         while loop.time() < ends_at and not drive.lost.is_set():
             try:
-                if not step.get("silent"):
+                if not step.get("silent") and loop.time() >= begins_at:
                     value = 0.0 if self._wiggles(step) else self.value()
                     self.note("gives", value)
-                    await drive(forward=value)
+                    await (drive.motor(step["motor"], value * WHEEL_FULL) if "motor" in step else drive(forward=value))
             except NeutralFirst:
                 self.note("gives", 0.0)
                 await drive.neutral()

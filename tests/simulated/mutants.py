@@ -15,10 +15,12 @@ import time
 from pathlib import Path
 
 from tests.simulated.mutants_data import MUTANTS, Mutant
+from tests.simulated.mutants_found import FOUND
 from tests.simulated.mutants_handover import HANDOVER
 
 ROOT = Path(__file__).parents[2]
 SEED = 20_000
+ALL = (*MUTANTS, *HANDOVER, *FOUND)
 
 
 def main() -> int:
@@ -29,9 +31,7 @@ def main() -> int:
     parser.add_argument("names", nargs="*", help="parts of names; by default all variants")
     options = parser.parse_args()
     missed = 0
-    chosen = [
-        each for each in (*MUTANTS, *HANDOVER) if not options.names or any(name in each.name for name in options.names)
-    ]
+    chosen = [each for each in ALL if not options.names or any(name in each.name for name in options.names)]
     for mutant in chosen:
         begun = time.monotonic()
         with tempfile.TemporaryDirectory(prefix="zbridge-mutant-") as folder:

@@ -79,7 +79,7 @@ class Obligations:
         elif what == "took over":
             has_token = self._tokens.pop(f"{who}+", float("inf")) <= self.world.now
             self._tokens[who] = self.world.now if has_token else float("inf")
-        elif what in ("announces", "withdraws") and fields[0].endswith("/@alive/gateway"):
+        elif what in ("announces", "withdraws") and fields[0].endswith("/r1/@alive/gateway"):
             self._tokens[who] = self.world.now if what == "announces" else float("inf")
         elif who == "robot":
             self._on_robot(what, fields)
@@ -89,8 +89,9 @@ class Obligations:
             self._ended_for[who] = self.world.now
 
     def _on_robot(self, what: str, fields: tuple[Any, ...]) -> None:
-        if what == "connected":
+        if what in ("connected", "starts datagrams"):
             self._connected_at = self.world.now
+        if what == "connected":
             grant = self.checker.current.get(self.checker.by_host.get(fields[0][0], ""))
             if grant is not None:  # docs/control.md, "hold back": a robot that was lost is stopped when it comes back
                 grant.autonomous = False

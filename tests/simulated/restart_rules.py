@@ -129,7 +129,7 @@ class RestartRules:
         successor = member.part("+")
         return self._given.get(name, False) and successor is not None and successor.process.alive
 
-    def _on_answers(self, name: str, part: str, key: str, payload: bytes, error: str, asker: str) -> None:
+    def _on_answers(self, name: str, part: str, key: str, payload: bytes, error: str, asker: str, _: bytes) -> None:
         if "@rpc/control/" in key and error == "None" and read(payload).get("ok"):
             when = "has not the robot yet" if part == "+" else "has handed over"
             self.checker.violate("restart-grant", f"{asker} got {key} of a process of {name} that {when}")

@@ -295,8 +295,17 @@ class TcpUdpRobot(SimRobot):
         """Read the client's settings: with UDP on both sides, ask for it and sleep."""
         size = int.from_bytes(body[:4], "little")
         if self.udp and len(body) > 4 + size and body[4 + size]:
-            self.send(end, 4)
-            self._asleep_until = self.world.now + 2.0
+            starts_s = self.options.get("starts_s")
+            if starts_s is None:
+                self.start(end)
+            else:
+                self.after(starts_s, lambda: self.start(end))
+
+    def start(self, end: End) -> None:
+        """Ask for datagrams, and sleep."""
+        self.world.note(self.name, "starts datagrams", end.peer.address)
+        self.send(end, 4)
+        self._asleep_until = self.world.now + 2.0
 
     def left(self, end: End) -> None:
         self._sources = {source: each for source, each in self._sources.items() if each is not end}
@@ -366,49 +375,3 @@ class AlfRobot(SimRobot):
             return None
         fields, self._text = list(self._text[:size]), self._text[size:]
         return fields
-
-
-class WebotsRobot(SimRobot):
-    """A Webots controller (WC2EC, deployed): two wheels, a distance sensor. It exits with its client, and restarts."""
-
-    telemetry_s = 0.25
-
-    def __init__(self, host: Host, name: str, network: Network, port: int, options: dict[str, Any]) -> None:
-        super().__init__(host, name, network, port, options)
-        self.lossless = True
-        self._free_at = 0.0
-        self._bytes = b""
-        self._wheels = {0: 0.0, 1: 0.0}
-
-    def may_accept(self) -> bool:
-        return super().may_accept() and not self.ends and self.world.now >= self._free_at
-
-    def left(self, end: End) -> None:
-        self._free_at = self.world.now + self.rng.uniform(1.0, 3.0)
-        self._bytes, self._wheels = b"", {0: 0.0, 1: 0.0}
-        self.drive(0.0)  # the controller is gone, and the simulation with it
-
-    def greet(self, end: End) -> None:
-        for number, (kind, name) in enumerate(((53, b"left"), (53, b"right"), (37, b"ds0"))):
-            end.send(bytes([0, kind, number, len(name)]) + name)
-
-    def tell(self, end: End) -> None:
-        self.put(end, bytes([1, 37, 2]) + struct.pack("<d", self.told + 1))
-
-    def read(self, end: End) -> None:
-        if end not in self.ends:
-            return
-        self._bytes += end.read(65536)
-        while len(self._bytes) >= 11:
-            command, _, number = self._bytes[:3]
-            if command != 130 or number not in self._wheels:
-                self.crash(f"command {command} to device {number}")
-                return
-            self._wheels[number] = struct.unpack("<d", self._bytes[3:11])[0]
-            self._bytes = self._bytes[11:]
-            value = max(map(abs, self._wheels.values()))
-            self.heard("motion" if value else "stop", value, "tcp", end)
-            self.drive(value)
-
-
-ROBOTS = {"tcpudp": TcpUdpRobot, "alf": AlfRobot, "wc2ec": WebotsRobot}

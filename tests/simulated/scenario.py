@@ -1,8 +1,9 @@
 """One scenario, which is JSON: who takes part, what they do, what fails and when. Building and running it.
 
 ``robot``: protocol and options of the robot. ``gateways``, ``drivers``, ``programs``: name, host, router and options.
-``control``: the table of the gateways. ``steps``: each has ``who`` and ``do``, or ``fault``; and ``t``, or ``when`` (a
-state) and ``after``. ``seconds``: how long, before everything is healed and the robot must be drivable once more.
+``others``: gateways of other robots, which are away. ``control``: the table of the gateways. ``steps``: each has
+``who`` and ``do``, or ``fault``; and ``t``, or ``when`` (a state) and ``after``. ``seconds``: how long, before
+everything is healed and the robot must be drivable once more.
 """
 
 from __future__ import annotations
@@ -25,10 +26,11 @@ from tests.simulated.engine import Host, World
 from tests.simulated.faults import Faults
 from tests.simulated.gateway_member import GatewayMember
 from tests.simulated.hq_programs import HQ_PROGRAMS, HqProgram
-from tests.simulated.members import DriverMember, Member
+from tests.simulated.members import ROBOT, DriverMember, Member
 from tests.simulated.net import Network, Paths
 from tests.simulated.restart_rules import RestartRules
-from tests.simulated.robots import ROBOTS
+from tests.simulated.robots import AlfRobot, SimRobot, TcpUdpRobot
+from tests.simulated.webots_robot import WebotsRobot
 
 HEAL_S = 14.0
 """Seconds without faults before the robot must be drivable."""
@@ -36,6 +38,7 @@ PROBE_S = 8.0
 LEAVE_S = 4.0
 ROBOT_PORT = 11001
 HQ_PORT = 12000
+ROBOTS: dict[str, type[SimRobot]] = {"tcpudp": TcpUdpRobot, "alf": AlfRobot, "wc2ec": WebotsRobot}
 
 
 class Outcome:
@@ -75,7 +78,9 @@ class Simulation:
         self.gateways = [self._gateway(each) for each in scenario["gateways"]]
         self.drivers = [self._driver(number, each) for number, each in enumerate(scenario["drivers"])]
         self.programs = [self._program(number, each) for number, each in enumerate(scenario.get("programs", []))]
-        self.members: dict[str, Member] = {each.name: each for each in [*self.gateways, *self.drivers]}
+        self.others = [self._gateway(each) for each in scenario.get("others", [])]
+        members = [*self.gateways, *self.drivers, *self.others]
+        self.members: dict[str, Member] = {each.name: each for each in members}
         self.checker = Checker(self)
         self.restart_rules = RestartRules(self)
         self.faults = Faults(self)
@@ -91,7 +96,7 @@ class Simulation:
         robot = self.scenario["robot"]
         device = {
             "protocol": robot["protocol"],
-            "connect": [f"tcp://robot:{ROBOT_PORT}"],
+            "connect": [f"tcp://{'away' if 'robot' in given else 'robot'}:{ROBOT_PORT}"],
             "options": robot.get("device", {}),
         }
         listeners = [
@@ -103,7 +108,7 @@ class Simulation:
             for number, protocol in enumerate(given.get("hq", []))
         ]
         configuration = {
-            "robot": {"name": "r1"},
+            "robot": {"name": given.get("robot", ROBOT)},
             "hq": listeners,
             "control": self.scenario.get("control", {}),
             "bus": {"mode": "client", "connect": ["tcp/router:7447"]},
@@ -140,7 +145,7 @@ class Simulation:
         self.restart_rules.ended()
         for driver in self.drivers:
             driver.stop()
-        for gateway in self.gateways:
+        for gateway in (*self.gateways, *self.others):
             gateway.stop()
         world.run_until(seconds + HEAL_S + PROBE_S + LEAVE_S)
         self.checker.ended()

@@ -12,6 +12,9 @@ if TYPE_CHECKING:
 NEWS_S = 0.2
 SETTLED_S = 1.5
 """Longest time that a handshake takes once the connection is there and the robot takes commands."""
+RIVAL_S = 5.0
+"""Longest time until a gateway has found that another one is gone: it asks every 0.5 s, for 1 s, and looks thrice."""
+RIVALS = ("another gateway serves", "a second connection is open")
 UDP_S = 2.5
 """How much longer a handshake with datagrams takes."""
 
@@ -24,6 +27,8 @@ class Shown:
         self._world = checker.world
         self._state: dict[str, str] = {}
         """By gateway, the state of its last ``status``."""
+        self._reason: dict[str, str] = {}
+        """By gateway, the reason that its last ``status`` gives."""
         self._apart_since: dict[str, float] = {}
         self._works_since: tuple[str | None, float] = (None, 0.0)
         self._latched_at = 0.0
@@ -33,7 +38,8 @@ class Shown:
         """Follow the trace."""
         if what == "puts" and who in self._checker.gateways:
             if fields[0].endswith("/status"):
-                self._state[who] = str(read(fields[1]).get("state"))
+                status = read(fields[1])
+                self._state[who], self._reason[who] = str(status.get("state")), str(status.get("reason"))
             elif fields[0].endswith("/control"):
                 self._on_control(who, read(fields[1]))
         elif what in ("killed", "ended"):
@@ -43,6 +49,7 @@ class Shown:
         """Compare ``status`` with the connections."""
         now, checker = self._world.now, self._checker
         self._note_latches()
+        self._look_for_rivals()
         works = checker.obligations.works()
         if works != self._works_since[0]:
             self._works_since = (works, now)
@@ -58,6 +65,17 @@ class Shown:
         if works is not None and settled and self._state.get(works) != "established" and self._judges(works, SETTLED_S):
             checker.violate("status", f"{works} shows {self._state.get(works)}, and its robot is established")
             self._works_since = (works, now)
+
+    def _look_for_rivals(self) -> None:
+        """``status`` names another gateway of the robot for as long as that one is there."""
+        serving = [each for each in self._checker.gateways.values() if each.serves]
+        alive = [each for each in serving if each.alive]
+        if len(serving) < 2 or len(alive) != 1 or not alive[0].running or not alive[0].session.link.whole:
+            return
+        gateway, since = alive[0].name, self._world.now - RIVAL_S
+        named = any(text in self._reason.get(gateway, "") for text in RIVALS)
+        if named and self._checker.obligations.calm_since(since) and self._checker.obligations.serves(gateway):
+            self._checker.violate("status", f"{gateway} runs alone, and shows: {self._reason.pop(gateway)}")
 
     def _note_latches(self) -> None:
         if any(self._checker.latches.values()):

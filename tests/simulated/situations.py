@@ -7,9 +7,14 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable
-from typing import Any
 
-Made = dict[str, Any]
+from tests.simulated.situations_found import FOUND
+from tests.simulated.steps import Made
+from tests.simulated.steps import drive as _drive
+from tests.simulated.steps import fault as _fault
+from tests.simulated.steps import second_gateway as _second_gateway
+from tests.simulated.steps import split as _split
+from tests.simulated.steps import stick as _stick
 
 
 def arrange(rng: random.Random, made: Made) -> None:
@@ -22,45 +27,6 @@ def arrange(rng: random.Random, made: Made) -> None:
         step["t"] = round(step["t"], 2)
     made["steps"].sort(key=lambda step: step["t"])
     made["seconds"] = round(max(step["t"] for step in made["steps"]) + 8.0, 1)
-
-
-def _drive(t: float, who: str, **more: Any) -> Made:
-    return {"t": t, "who": who, "do": "drive", "for": 4.0, "deadman_s": 0.5, "hz": 10.0, **more}
-
-
-def _fault(t: float, fault: str, **more: Any) -> Made:
-    return {"t": t, "fault": fault, **more}
-
-
-def _second_gateway(made: Made) -> None:
-    made["gateways"] = [
-        {"name": "gw1", "host": "gw1", "router": "router1"},
-        {"name": "gw2", "host": "gw2", "router": "router2"},
-    ]
-    for driver, router in zip(made["drivers"], ("router1", "router2"), strict=True):
-        driver["router"] = router
-
-
-def _stick(rng: random.Random, made: Made, *, alone: bool) -> Made:
-    """Let one HQ program take part; alone: its listener is a process of its own."""
-    protocol = rng.choice(("tcpudp", "tcpudp", "alf", "wc2ec"))
-    if made["robot"]["protocol"] == "alf":
-        protocol = rng.choice(("tcpudp", "alf"))
-    made["gateways"] = [{"name": "gw1", "host": "gw1", "router": "router1"}]
-    gateway = made["gateways"][0]
-    if alone:
-        gateway = {"name": "hq1", "host": "hq1", "router": "router1", "device": False}
-        made["gateways"].append(gateway)
-    gateway["hq"] = [protocol]
-    program = {"name": "stick1", "host": "desk1", "protocol": protocol, "gateway_host": gateway["host"]}
-    made["programs"] = [{**program, "listener": 0, "options": {}}]
-    return gateway
-
-
-def _split(rng: random.Random, made: Made, *, t: float, s: float) -> list[Made]:
-    """Cut the bus between two gateways, so that both serve the robot, and heal it."""
-    _second_gateway(made)
-    return [_fault(t, "cut", between=["router1", "router2"], both=True, **{"for": s})]
 
 
 def _silent_holder(rng: random.Random, made: Made) -> None:
@@ -175,7 +141,8 @@ def _called_off(rng: random.Random, made: Made) -> None:
     made["drivers"][0]["options"] = {}  # the client that chooses modes
     then = rng.choice((None, None, "manual"))
     drive = _drive(5.0, "op1", mode="autonomous", silent=True, then=then, hz=rng.choice((20.0, 50.0)), holds=1.0)
-    made["steps"] = [_fault(4.0, "threads", target="gw1", by=0.8, **{"for": 6.0}), drive | {"for": 0.01}]
+    slow = _fault(4.0, "threads", target="gw1", by=rng.choice((0.4, 0.4, 0.8)), **{"for": 6.0})
+    made["steps"] = [slow, drive | {"for": 0.01}]
 
 
 def _busy_program(rng: random.Random, made: Made) -> None:
@@ -280,6 +247,7 @@ SITUATIONS: tuple[Callable[[random.Random, Made], None], ...] = (
     _killed_in_mode_3,
     _killed_in_mode_3,
     _called_off,
+    _called_off,
     _busy_program,
     _pushed_while_away,
     _used_up,
@@ -289,4 +257,5 @@ SITUATIONS: tuple[Callable[[random.Random, Made], None], ...] = (
     _released_meanwhile,
     _killed_driver,
     _forged_and_flooded,
+    *FOUND,
 )

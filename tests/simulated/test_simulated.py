@@ -13,9 +13,8 @@ import pytest
 from tests.simulated.accounts import Command, Grant, motions
 from tests.simulated.engine import Host, Process, SimLoop, World
 from tests.simulated.generate import PROFILES, scenario
-from tests.simulated.mutants import ROOT, caught_by
+from tests.simulated.mutants import ALL, ROOT, caught_by
 from tests.simulated.mutants_data import MUTANTS
-from tests.simulated.mutants_handover import HANDOVER
 from tests.simulated.scenario import run
 from tests.simulated.shrink import shrink
 
@@ -49,7 +48,7 @@ def test_the_findings_that_began_it_are_found_again(name: str, tmp_path: Path) -
 
 
 def test_every_broken_variant_still_finds_what_it_breaks() -> None:
-    found = {each.name: (ROOT / each.file).read_text().count(each.old) for each in (*MUTANTS, *HANDOVER)}
+    found = {each.name: (ROOT / each.file).read_text().count(each.old) for each in ALL}
     assert {name: times for name, times in found.items() if times != 1} == {}
 
 

@@ -45,6 +45,8 @@ class Written:
         """Gateways whose last frame of the kind was motion."""
         self._aside: set[str] = set()
         self._connected_at = 0.0
+        self._open: dict[str, tuple[End, float]] = {}
+        """By gateway, its connection to the robot once a stop was written to it, and when it was open last."""
 
     def watch(self, who: str, what: str, fields: tuple[Any, ...]) -> None:
         """Follow the trace."""
@@ -54,6 +56,7 @@ class Written:
             if gateway is not None:
                 self._owes[gateway] = "since the robot was connected"
                 self._moves.discard(gateway)
+                self._hold_back(gateway)
         elif what == "withdraws" and who in self._checker.gateways and fields[0].endswith("/@alive/gateway"):
             self._on_aside(who)
         elif what == "announces" and who in self._aside and fields[0].endswith("/@alive/gateway"):
@@ -64,7 +67,8 @@ class Written:
         """Take what a gateway wrote."""
         protocol = self._checker.protocol
         if stops(protocol, data):
-            self._owes.pop(gateway, None)
+            if self._owes.pop(gateway, "").endswith("connected"):
+                self._note_open(gateway)
             self._moves.discard(gateway)
         elif any(kind != "mode" or value == 3.0 for kind, value in motions(protocol, data)):
             self._moves.add(gateway)
@@ -75,7 +79,10 @@ class Written:
                 self._checker.violate("stop-first", f"{gateway} wrote motion, and no stop {why}")
 
     def tick(self) -> None:
-        """Note the links that are stalled."""
+        """Note the links that are open, and those that are stalled."""
+        for gateway, (end, _) in self._open.items():
+            if not (end.closed or end.broken or end.finished):
+                self._open[gateway] = (end, self._world.now)
         for end in self._links():
             gateway = end.process.name
             reachable = self._up(end)
@@ -83,6 +90,20 @@ class Written:
             if not reachable and end.unacknowledged and waited_s > STALLED_S and self._ran(gateway, STALLED_S):
                 self._owes[gateway] = "since its link was stalled"
                 self._checker.counts["a link was stalled"] += 1
+
+    def _note_open(self, gateway: str) -> None:
+        """Note the connection that a gateway established: it writes a stop at once."""
+        for end in self._links():
+            if end.process.name == gateway:
+                self._open[gateway] = (end, self._world.now)
+
+    def _hold_back(self, gateway: str) -> None:
+        """Whoever held a robot that was lost must say neutral: docs/control.md, "hold back"."""
+        _, open_at = self._open.pop(gateway, (None, 0.0))
+        grant = self._checker.current.get(gateway)
+        if grant is not None and grant.ended_at is None and grant.at < open_at:
+            grant.held_back = True
+            self._checker.counts["a held robot was lost, and is back"] += 1
 
     def _on_aside(self, gateway: str) -> None:
         """A gateway that leaves its robot to another one stops it, over the connection that it keeps."""

@@ -209,10 +209,10 @@ TRANSLATED = "messages of the robot are translated"
         ),
         (with_session(lost=lambda self, reason: None), {END: "still does something"}),
         (with_session(timers=lambda self: 0.0), {"what the robot said establishes a session": "writes and timers"}),
-        (with_robot(_at=lambda self, message, stamp_ns: {}[message.x]), {TRANSLATED: "KeyError", GARBAGE: "KeyError"}),
-        (with_robot(_at=lambda *_: ((topics.POSE, Switch(on=True)),)), {TRANSLATED: "PayloadError"}),
+        (with_robot(pose=lambda self, message, stamp_ns: {}[message.x]), {TRANSLATED: "KeyError", GARBAGE: "KeyError"}),
+        (with_robot(pose=lambda *_: ((topics.POSE, Switch(on=True)),)), {TRANSLATED: "PayloadError"}),
         (
-            with_robot(_at=lambda self, message, stamp_ns: toy.ToyRobot._at(self, message, 0)),
+            with_robot(pose=lambda self, message, stamp_ns: toy.ToyRobot.pose(self, message, 0)),
             {TRANSLATED: "pose has the stamp 0, given was"},
         ),
     ],

@@ -5,27 +5,43 @@ import pytest
 from zbridge.simulation.judge import Chances, Ended, Judge, show
 
 
+class Strict(Judge):
+    """A judge that a test tells what to record."""
+
+    def violate(self, text: str) -> None:
+        self._violate(text)
+
+    def happen(self, text: str) -> None:
+        self._event(text)
+
+    def die(self, text: str) -> None:
+        self._die(text)
+
+    def report(self, problem: str, raw: str, *, deadly: bool = False) -> bool:
+        return self._report(problem, raw, deadly=deadly)
+
+
 def test_a_judge_notes_what_is_wrong_and_what_happened_within_its_bound_and_says_of_what_it_dies() -> None:
     noted: list[str] = []
-    judge = Judge(keep=2, note=noted.append)
-    judge._violate("wrong")
+    judge = Strict(keep=2, note=noted.append)
+    judge.violate("wrong")
     assert (judge.alive, judge.death) == (True, "")
     with pytest.raises(Ended, match="died: an unknown id"):
-        judge._die("an unknown id")
-    judge._violate("wrong again")
+        judge.die("an unknown id")
+    judge.violate("wrong again")
     for number in range(3):
-        judge._event(f"happened {number}")
+        judge.happen(f"happened {number}")
     assert (judge.violations, judge.events) == (["wrong", "an unknown id"], ["happened 0", "happened 1"])
     assert noted == ["wrong", "an unknown id", "wrong again"], "who listens hears of all"
     assert (judge.alive, judge.death) == (False, "an unknown id")
 
 
 def test_a_fault_in_a_message_is_recorded_with_its_bytes_and_a_deadly_one_ends_the_judge() -> None:
-    judge = Judge(keep=2)
-    assert not judge._report("", "01 02")
-    assert judge._report("a wrong length", "01 02")
+    judge = Strict(keep=2)
+    assert not judge.report("", "01 02")
+    assert judge.report("a wrong length", "01 02")
     with pytest.raises(Ended):
-        judge._report("an unknown id", "03", deadly=True)
+        judge.report("an unknown id", "03", deadly=True)
     assert judge.violations == ["a wrong length: 01 02", "an unknown id: 03"]
     assert judge.death == "an unknown id: 03"
     for number in range(3):

@@ -20,7 +20,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from tests.e2e.processes import NotHereError, apart, ip
+from tests.e2e.rigs.processes import NotHereError, apart, ip
 from tests.soak.faults import Faults
 from tests.soak.gates import Gate, Measured, loss_gates, quantile
 from tests.soak.network import missing

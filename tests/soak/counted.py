@@ -13,8 +13,8 @@ import threading
 import time
 from typing import Any
 
-from tests.e2e import restarts
-from tests.e2e.robots import MOVE, Frame, position
+from tests.e2e.measured import restarts
+from tests.e2e.rigs.robots import MOVE, Frame, position
 
 TICK_S = 1e-5
 WRAP = 10_000_000

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
-from tests.e2e.hq_churn import use
+from tests.e2e.measured.hq_churn import use
 from tests.soak.network import CLEAN, Link
 from tests.soak.recorder import Recorder
 from tests.soak.scene import COUNTED, ROBOT_PLANS, Scene

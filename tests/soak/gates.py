@@ -10,8 +10,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 from tests.e2e.conftest import until
-from tests.e2e.hq_churn import use
-from tests.e2e.robots import SCALE
+from tests.e2e.measured.hq_churn import use
+from tests.e2e.rigs.robots import SCALE
 from tests.soak.scene import COUNTED, LOSS_COUNTERS, Scene
 
 WARM_UP_S = 600.0

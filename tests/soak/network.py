@@ -19,7 +19,7 @@ import time
 from collections import deque
 from pathlib import Path
 
-from tests.e2e.processes import Namespace, Part, ip
+from tests.e2e.rigs.processes import Namespace, Part, ip
 
 _TUNSETIFF, _TUN_WITHOUT_HEADER = 0x400454CA, 0x1001
 _PACKET_BYTES = 65_536

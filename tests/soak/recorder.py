@@ -11,7 +11,7 @@ import sys
 from collections import Counter
 from pathlib import Path
 
-from tests.e2e.processes import ROOT, Part
+from tests.e2e.rigs.processes import ROOT, Part
 from zbridge.views.recording.reader import RecordingReader
 
 DISK = "3m"

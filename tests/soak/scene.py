@@ -19,12 +19,12 @@ from queue import Queue
 import msgpack
 import zenoh
 
-from tests.e2e import loss
 from tests.e2e.conftest import Fleet, configuration, until
-from tests.e2e.fragile import ROBOTS, charges
-from tests.e2e.processes import LINE_S, Namespace, Part, ip
-from tests.e2e.stalls import MovingRobot
-from tests.e2e.supervised import Supervised, children
+from tests.e2e.rigs import loss
+from tests.e2e.rigs.fragile import ROBOTS, charges
+from tests.e2e.rigs.moving_robot import MovingRobot
+from tests.e2e.rigs.processes import LINE_S, Namespace, Part, ip
+from tests.e2e.rigs.supervised import Supervised, children
 from tests.soak import counted
 from tests.soak.network import Link
 
@@ -41,7 +41,7 @@ LOSS_COUNTERS = ("bus_out_dropped", "bus_out_replaced", "untranslatable", "malfo
 
 @dataclass(frozen=True)
 class Plan:
-    """A robot: which fragile one it is, and the program of ``tests.e2e.hq_programs`` that may drive it.
+    """A robot: which fragile one it is, and the program of ``tests.e2e.rigs.hq_programs`` that may drive it.
 
     steady: its gateway is never killed or restarted, so that what it uses can be compared over hours.
     """

@@ -17,11 +17,11 @@ from dataclasses import dataclass, field
 
 import zenoh
 
-from tests.e2e import loss
-from tests.e2e.loss import commander
-from tests.e2e.processes import Part, module
-from tests.e2e.robots import SCALE
-from tests.e2e.stalls import TOLERANCE, MovingRobot
+from tests.e2e.rigs import loss
+from tests.e2e.rigs.loss import commander
+from tests.e2e.rigs.moving_robot import TOLERANCE, MovingRobot
+from tests.e2e.rigs.processes import Part, module
+from tests.e2e.rigs.robots import SCALE
 from tests.proofs import packed
 from tests.soak.scene import ROBOT_PLANS, Scene
 
@@ -115,7 +115,7 @@ class Turns(threading.Thread):
                 stack, *loss.driver(self._scene.reach, self._name, DEADMAN_S, RATE_HZ, round(self._speed * SCALE), 0)
             )
         where = (self._scene.bus_link.far, self._scene.hq_port(self._name))
-        program = Part(stack, *module("hq_programs", self._plan.program, *where))
+        program = Part(stack, *module("tests.e2e.rigs.hq_programs", self._plan.program, *where))
         assert program.line(BEGINS_S) == "ready"
         program.say("push")
         return program

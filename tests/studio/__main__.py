@@ -17,7 +17,7 @@ from playwright.sync_api import Page, sync_playwright
 
 import zbridge
 from tests.e2e.conftest import Bench, until
-from tests.e2e.foxglove_viewer import viewing
+from tests.e2e.rigs.foxglove_viewer import viewing
 from tests.e2e.test_foxglove import Server
 from tests.studio.pages import serve_pages
 from tests.views.foxglove.recordings import record

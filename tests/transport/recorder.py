@@ -2,8 +2,9 @@
 
 import asyncio
 import contextlib
+import os
 import socket
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterator
 from dataclasses import dataclass
 
 from zbridge.protocol.address import Address
@@ -86,10 +87,11 @@ class Pair:
         return self.far.link
 
 
-def socket_of(link: TcpLink) -> socket.socket:
-    assert link._transport is not None
-    found: socket.socket = link._transport.get_extra_info("socket")
-    return found
+@contextlib.contextmanager
+def socket_of(link: TcpLink) -> Iterator[socket.socket]:
+    """Lend a duplicate of a link's socket."""
+    with socket.socket(fileno=os.dup(link.descriptors[0])) as sock:
+        yield sock
 
 
 @contextlib.asynccontextmanager

@@ -30,12 +30,13 @@ async def test_both_ends_are_attached_first_know_their_peer_and_exchange_bytes()
         await pair.near.until("received", received=4)
         assert pair.near.data == b"pong"
         for link, give_up_ms in ((pair.here, 60_000), (pair.there, 10_000)):  # a robot's connection is kept for longer
-            sock = socket_of(link)
-            assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY), "every write is a segment"
-            assert sock.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
-            assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) == give_up_ms
-        with contextlib.suppress(OSError):  # a kernel before 6.15; what was lost is sent again within a second
-            assert socket_of(pair.here).getsockopt(socket.IPPROTO_TCP, 44) == 1000
+            with socket_of(link) as sock:
+                assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY), "every write is a segment"
+                assert sock.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
+                assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) == give_up_ms
+        with contextlib.suppress(OSError), socket_of(pair.here) as sock:
+            # a kernel before 6.15 has no such option; what was lost is sent again within a second
+            assert sock.getsockopt(socket.IPPROTO_TCP, 44) == 1000
 
 
 class Watcher(Recorder):
@@ -79,7 +80,8 @@ async def test_what_was_written_before_closing_arrives_and_a_lost_link_takes_cal
 
 async def test_a_peer_that_breaks_off_is_noticed_with_the_reason() -> None:
     async with connected() as pair:
-        socket_of(pair.there).setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        with socket_of(pair.there) as sock:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         pair.there.abort()
         await pair.near.until("lost")
         assert (pair.near.reason or "").startswith("connection lost: ")

@@ -106,10 +106,11 @@ async def _serve(client: socket.socket, metrics: Metrics, missing: Missing) -> N
                 request += data
                 if not data or len(request) > _REQUEST_BYTES:
                     return
-            await loop.sock_sendall(client, _response(request, metrics, missing))
+            await loop.sock_sendall(client, respond(request, metrics, missing))
 
 
-def _response(request: bytes, metrics: Metrics, missing: Missing) -> bytes:
+def respond(request: bytes, metrics: Metrics, missing: Missing) -> bytes:
+    """Answer an HTTP request. missing: gives the reasons for which the process is not ready."""
     status = "200 OK"
     if request.startswith((b"GET /metrics ", b"GET / ")):
         body = metrics.exposition().encode()

@@ -1,5 +1,7 @@
-"""What a gateway takes from its machine: clocks, randomness, sockets, processes, a folder, the bus, and the file of its
-audit log. A simulation injects its own :class:`Runtime`.
+"""What a gateway takes from its machine.
+
+Clocks, randomness, sockets, processes, a folder, the bus, and the file of its audit log. A simulation injects its own
+:class:`Runtime`.
 """
 
 from __future__ import annotations

@@ -38,11 +38,11 @@ def _meet(one: list[str], other: list[str]) -> bool:
 
 
 class FakeBus:
-    """One of several sessions on a shared fake bus: ``FakeBus()`` makes the first, ``join()`` another."""
+    """One of several sessions on one :class:`FakeNetwork`: ``FakeBus()`` makes the first, ``join()`` another."""
 
-    def __init__(self, zid: str = "1", shared: _Shared | None = None) -> None:
+    def __init__(self, zid: str = "1", network: FakeNetwork | None = None) -> None:
         self._zid = zid
-        self._shared = shared or _Shared()
+        self.network = network or FakeNetwork()
         self._relief: list[Callable[[], None]] = []
         self._connected: list[Callable[[bool], None]] = []
         self._handles: list[Handle] = []
@@ -59,7 +59,7 @@ class FakeBus:
 
     def join(self, zid: str) -> FakeBus:
         """Open another session on the same bus."""
-        return FakeBus(zid, self._shared)
+        return FakeBus(zid, self.network)
 
     def routers(self) -> list[str]:
         """Return no router: sessions of a fake bus need none."""
@@ -67,7 +67,7 @@ class FakeBus:
 
     def values(self, key_expr: str) -> list[bytes]:
         """Return every payload that was put on matching keys, in order."""
-        return [sample.payload for sample in self._shared.history if matches(key_expr, sample.key)]
+        return [sample.payload for sample in self.network.history if matches(key_expr, sample.key)]
 
     def connection(self, up: bool) -> None:
         """Simulate the loss or the return of the bus."""
@@ -93,8 +93,8 @@ class FakeBus:
 
     def publisher(self, key: str, topic: Topic, last: bytes | None = None) -> Publisher:
         if last is not None:
-            self._shared.last[key] = last
-        return self._keep(_FakePublisher(key, self._shared, keeps_last=topic.qos.keeps_last))
+            self.network.last[key] = last
+        return self._keep(_FakePublisher(key, self.network, keeps_last=topic.qos.keeps_last))
 
     def put_all(self, batch: Batch) -> bool:
         for publisher, payloads in batch:
@@ -116,12 +116,13 @@ class FakeBus:
         direct: bool = False,
     ) -> Handle:
         entry = (key_expr, handler)
-        self._shared.subscribers.append(entry)
+        self.network.lanes[key_expr] = lane
+        self.network.subscribers.append(entry)
         if history or kept:
-            for key, payload in tuple(self._shared.last.items()):
+            for key, payload in tuple(self.network.last.items()):
                 if matches(key_expr, key):
                     handler(Sample(key, payload))
-        return self._keep(_FakeHandle(lambda: self._shared.subscribers.remove(entry)))
+        return self._keep(_FakeHandle(lambda: self.network.subscribers.remove(entry)))
 
     def answer(
         self,
@@ -132,17 +133,17 @@ class FakeBus:
         complete: bool = False,
     ) -> Handle:
         entry = (key, handler, self._zid)
-        self._shared.queryables.append(entry)
-        return self._keep(_FakeHandle(lambda: self._shared.queryables.remove(entry)))
+        self.network.queryables.append(entry)
+        return self._keep(_FakeHandle(lambda: self.network.queryables.remove(entry)))
 
     async def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
         queries = []
-        for key, handler, zid in tuple(self._shared.queryables):
+        for key, handler, zid in tuple(self.network.queryables):
             if meet(key_expr, key):
                 concrete = key if is_concrete(key) else key_expr
                 queries.append((query := FakeQuery(concrete, payload, asked=key_expr), zid))
                 handler(query)
-        kept = [Answer(key, last) for key, last in self._shared.last.items() if matches(key_expr, key)]
+        kept = [Answer(key, last) for key, last in self.network.last.items() if matches(key_expr, key)]
         replies = [(reply, zid) for query, zid in queries for reply in query.replies]
         return [msgspec.structs.replace(reply, replier=zid) for reply, zid in replies] + kept
 
@@ -150,25 +151,25 @@ class FakeBus:
         """Do nothing: handlers are called at once."""
 
     def announce(self, key: str) -> Handle:
-        self._shared.tokens.append(key)
-        self._shared.tell(key, True)
+        self.network.tokens.append(key)
+        self.network.notify(key, True)
 
         def withdraw() -> None:
-            self._shared.tokens.remove(key)
-            self._shared.tell(key, False)
+            self.network.tokens.remove(key)
+            self.network.notify(key, False)
 
         return self._keep(_FakeHandle(withdraw))
 
     async def alive(self, key_expr: str, *, timeout_s: float = 0.5) -> list[str]:
-        return sorted({token for token in self._shared.tokens if matches(key_expr, token)})
+        return sorted({token for token in self.network.tokens if matches(key_expr, token)})
 
     def watch_alive(self, key_expr: str, handler: Callable[[str, bool], None]) -> Handle:
         entry = (key_expr, handler)
-        self._shared.watchers.append(entry)
-        for token in tuple(self._shared.tokens):
+        self.network.watchers.append(entry)
+        for token in tuple(self.network.tokens):
             if matches(key_expr, token):
                 handler(token, True)
-        return self._keep(_FakeHandle(lambda: self._shared.watchers.remove(entry)))
+        return self._keep(_FakeHandle(lambda: self.network.watchers.remove(entry)))
 
     async def flush(self) -> None:
         pass
@@ -179,8 +180,8 @@ class FakeBus:
     def frames(
         self, key: str, listened: Callable[[bool], None], *, best_effort: bool = False, kept: int = 0
     ) -> Publisher:
-        publisher = self._keep(_FakePublisher(key, self._shared, keeps_last=bool(kept)))
-        if any(meet(key_expr, key) for key_expr, _ in self._shared.subscribers):
+        publisher = self._keep(_FakePublisher(key, self.network, keeps_last=bool(kept), listened=listened))
+        if any(meet(key_expr, key) for key_expr, _ in self.network.subscribers):
             asyncio.get_running_loop().call_soon(listened, True)
         return publisher
 
@@ -203,19 +204,23 @@ class FakeBus:
         return handle
 
 
-class _Shared:
-    """The state that all sessions of one fake bus share."""
+class FakeNetwork:
+    """What all sessions of one fake bus share; a test may read all of it."""
 
     def __init__(self) -> None:
         self.subscribers: list[tuple[str, Callable[[Sample], None]]] = []
+        self.lanes: dict[str, Lane | Sort] = {}
+        """What the last subscriber of each key expression gave; a fake bus itself sorts nothing."""
         self.queryables: list[tuple[str, Callable[[IncomingQuery], None], str]] = []
         self.tokens: list[str] = []
         self.watchers: list[tuple[str, Callable[[str, bool], None]]] = []
+        self.listened: list[tuple[str, Callable[[bool], None]]] = []
+        """The keys of those who ask whether anybody listens, and what to call when that changes."""
         self.last: dict[str, bytes] = {}
         self.history: list[Sample] = []
 
-    def tell(self, key: str, alive: bool) -> None:
-        """Call the watchers of a liveliness token that came or went."""
+    def notify(self, key: str, alive: bool) -> None:
+        """Call the watchers of a liveliness token that appeared or disappeared."""
         for key_expr, handler in tuple(self.watchers):
             if matches(key_expr, key):
                 handler(key, alive)
@@ -232,28 +237,34 @@ class _FakeHandle:
 
 
 class _FakePublisher(_FakeHandle):
-    def __init__(self, key: str, shared: _Shared, *, keeps_last: bool) -> None:
+    def __init__(
+        self, key: str, network: FakeNetwork, *, keeps_last: bool, listened: Callable[[bool], None] | None = None
+    ) -> None:
         super().__init__(self._forget)
         self.key = key
-        self._shared = shared
+        self._network = network
         self._keeps_last = keeps_last
+        self._listened = [(key, listened)] if listened is not None else []
+        network.listened += self._listened
 
     @property
     def last(self) -> bytes | None:
-        return self._shared.last.get(self.key)
+        return self._network.last.get(self.key)
 
     def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
         sample = Sample(self.key, payload, attachment)
-        self._shared.history.append(sample)
+        self._network.history.append(sample)
         if self._keeps_last:
-            self._shared.last[self.key] = payload
-        for key_expr, handler in tuple(self._shared.subscribers):
+            self._network.last[self.key] = payload
+        for key_expr, handler in tuple(self._network.subscribers):
             if meet(key_expr, self.key):
                 handler(sample)
         return True
 
     def _forget(self) -> None:
-        self._shared.last.pop(self.key, None)
+        for entry in self._listened:
+            self._network.listened.remove(entry)
+        self._network.last.pop(self.key, None)
 
 
 class FakeQuery:

@@ -56,8 +56,10 @@ class Camera:
         self._conditions = conditions
         self._clock_ns = clock_ns
         self._loop = asyncio.get_running_loop()
-        self._demand = demand = Demand()
-        self._latest = latest = Latest()
+        self.demand = demand = Demand()
+        """Who watches, on the bus and by the relay."""
+        self.latest = latest = Latest()
+        """The newest picture."""
         self._relay: Relay | None = None
         if plan.relay is not None:
             self._relay = Relay(plan, plan.relay, demand, latest, metrics, lambda text: conditions.set(_RELAY, text))
@@ -71,10 +73,10 @@ class Camera:
         self._failures = metrics.count("camera_failures")
 
     def __repr__(self) -> str:
-        return f"<Camera {self._plan.source} {self._demand!r}>"
+        return f"<Camera {self._plan.source} {self.demand!r}>"
 
     async def run(self) -> None:
-        watch = self._bus.watch_listeners(self._key, self._demand.listen)
+        watch = self._bus.watch_listeners(self._key, self.demand.listen)
         try:
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(self._follow())
@@ -91,9 +93,9 @@ class Camera:
         """Fetch the stream whenever somebody watches."""
         backoff = Backoff(most_s=RETRY_S)
         while True:
-            if not self._demand.wanted:
+            if not self.demand.wanted:
                 self._conditions.set(_CONDITION, None)
-            await self._demand.begin()
+            await self.demand.begin()
             begun = self._loop.time()
             reason = await self._fetch()
             self._reset()
@@ -112,7 +114,7 @@ class Camera:
         """Fetch until the stream ends; return why it ended. None: nobody watches any more."""
         log.info("camera %s: connecting", self._plan.source)
         try:
-            await race(fetch(self._plan.source, self._plan.settings.stall_s, self._receive), self._demand.end())
+            await race(fetch(self._plan.source, self._plan.settings.stall_s, self._receive), self.demand.end())
         except (LinkError, ProtocolError) as error:
             return str(error)
         except Exception as error:
@@ -128,8 +130,8 @@ class Camera:
         self._pictures.value += len(parts)
         self._conditions.set(_CONDITION, None)
         for part in parts:
-            self._latest.show(stream, part)
-        if self._demand.listened:
+            self.latest.show(stream, part)
+        if self.demand.listened:
             self._dropped.value += len(parts) - 1
             self._pace.offer((parts[-1], self._clock_ns()))
             self._publish()
@@ -156,7 +158,7 @@ class Camera:
 
     def _reset(self) -> None:
         """Forget the pictures of a stream that has ended."""
-        self._latest.forget()
+        self.latest.forget()
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None

@@ -1,4 +1,6 @@
-"""The command line: ``zbridge run, check, init, simulate, probe, demo, router, foxglove, ls, health, echo, drive, stop,
+"""The command line.
+
+Commands: ``zbridge run, check, init, simulate, probe, demo, router, foxglove, ls, health, echo, drive, stop,
 unlatch, restart, certs, record, info, export, mark, replay, ros2``.
 
 Knows no protocol. Only this package imports typer and rich, and this module does not: ``zbridge run`` loads neither.

@@ -57,7 +57,7 @@ class Row(msgspec.Struct):
     counts: Counter[str] = msgspec.field(default_factory=Counter)
 
 
-class Watch:
+class LiveTable:
     """Collects what the robots publish and draws the table."""
 
     def __init__(self, robots: list[str]) -> None:
@@ -102,7 +102,7 @@ async def run_demo(seconds: float, *, secure: bool = False) -> None:
     secure: on mutual TLS, with roles; raises ConfigError where no certificates can be made.
     """
     robots = {f"{name}1": name for name in protocol_names() if _is_whole(name)}
-    watch = Watch(list(robots))
+    watch = LiveTable(list(robots))
     async with contextlib.AsyncExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="zbridge-demo-")))
         log = stack.enter_context((folder / "log").open("w+b"))
@@ -215,7 +215,7 @@ def _inline(value: object) -> str:
     return json.dumps(value)
 
 
-async def _show(fleet: Fleet, watch: Watch, seconds: float, how: list[str]) -> None:
+async def _show(fleet: Fleet, watch: LiveTable, seconds: float, how: list[str]) -> None:
     """Say how to take part, draw the table, and drive each robot until somebody else does."""
     for line in how:
         print(line, flush=True)  # noqa: T201

@@ -10,7 +10,7 @@ from pathlib import Path
 from zbridge.app import until_signal
 from zbridge.cli import set_up_log
 from zbridge.errors import ConfigError
-from zbridge.host.fork_client import fork_server_command, module_command
+from zbridge.host.fork_client import ForkClient, fork_server_command, module_command
 from zbridge.host.replacement import restore
 from zbridge.host.settings import HostSettings, load_host
 from zbridge.host.supervisor import Supervisor
@@ -22,7 +22,7 @@ def supervise(paths: tuple[Path, ...], *, watch: bool, verbose: bool) -> None:
     if missing := [path for path in paths if not path.exists()]:
         raise ConfigError(f"{missing[0]}: No such file or directory")
     itself = _itself(paths, watch=watch, verbose=verbose)
-    supervisor = Supervisor(paths, _host(paths), fork_server_command(), watch=watch, verbose=verbose, itself=itself)
+    supervisor = Supervisor(paths, _host(paths), _forks(), watch=watch, verbose=verbose, itself=itself)
     _run(supervisor)
 
 
@@ -37,7 +37,7 @@ def resume(descriptor: int, *, only_check: bool) -> None:
     supervisor = Supervisor(
         paths,
         HostSettings(stagger_s=state.stagger_s, file_bytes=state.file_bytes),
-        fork_server_command(),
+        _forks(),
         watch=state.watch,
         verbose=state.verbose,
         itself=_itself(paths, watch=state.watch, verbose=state.verbose),
@@ -51,6 +51,10 @@ def resume(descriptor: int, *, only_check: bool) -> None:
 def _run(supervisor: Supervisor) -> None:
     gc.freeze()
     asyncio.run(until_signal(supervisor.run()))
+
+
+def _forks() -> ForkClient:
+    return ForkClient(fork_server_command())
 
 
 def _itself(paths: tuple[Path, ...], *, watch: bool, verbose: bool) -> list[str]:

@@ -87,7 +87,7 @@ class RefusalLimit:
                 yield _REFUSALS[code], count
 
 
-class _Kind(msgspec.Struct, frozen=True):
+class _CommandRule(msgspec.Struct, frozen=True):
     """What a key's commands are: whether they need the lease, and the most bytes they may have."""
 
     leased: bool
@@ -95,8 +95,8 @@ class _Kind(msgspec.Struct, frozen=True):
     stop: bool = False
 
 
-_STOP = _Kind(leased=False, most_bytes=0, stop=True)
-_UNKNOWN = _Kind(leased=False, most_bytes=topics.LARGE_BYTES)
+_STOP = _CommandRule(leased=False, most_bytes=0, stop=True)
+_UNKNOWN = _CommandRule(leased=False, most_bytes=topics.LARGE_BYTES)
 
 
 class QueryFilter:
@@ -147,7 +147,7 @@ class CommandFilter:
         self._prover = QueryFilter(authority, clock, notes=True)
         self.refusals = self._prover.refusals
         self._open = RateLimit(OPEN_HZ)
-        self._kinds: dict[str, _Kind] = {}
+        self._rules: dict[str, _CommandRule] = {}
         self._stopped_at = float("-inf")
         self.same_stops = 0
         """Stops that were counted only."""
@@ -156,7 +156,7 @@ class CommandFilter:
         return f"<CommandFilter {self._keys.robot} {self.refusals!r}>"
 
     def __call__(self, key: str, shown: bytes | None, size: int, read_payload: Look) -> Lane | None:
-        kind = self._kinds.get(key) or self._find(key)
+        kind = self._rules.get(key) or self._find(key)
         if kind.stop:
             return self._stop(read_payload() if size else b"")
         if size > kind.most_bytes:
@@ -182,19 +182,19 @@ class CommandFilter:
             return None
         return Lane.STOP if stop_id is UNSET else Lane.LATCH
 
-    def _find(self, key: str) -> _Kind:
+    def _find(self, key: str) -> _CommandRule:
         kind = self._read(key)
-        if len(self._kinds) < _KEPT:
-            self._kinds[key] = kind
+        if len(self._rules) < _KEPT:
+            self._rules[key] = kind
         return kind
 
-    def _read(self, key: str) -> _Kind:
+    def _read(self, key: str) -> _CommandRule:
         if is_stop(key):
             return _STOP
         topic = topics.find(self._keys.path(key)) if topics.is_concrete(key) else None
         if topic is None or topic.most_bytes is None:
             return _UNKNOWN
-        return _Kind(leased=topic.message in OF_THE_HOLDER, most_bytes=topic.most_bytes)
+        return _CommandRule(leased=topic.message in OF_THE_HOLDER, most_bytes=topic.most_bytes)
 
 
 class NameFilter:

@@ -14,7 +14,7 @@ from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import KeySpace, Topic
 from zbridge.lease.lease_holder import raw_ms
 from zbridge.metrics import Metrics
-from zbridge.protocol.plugin import Robot
+from zbridge.protocol.plugin import RobotSide
 
 log = logging.getLogger("zbridge.robot.commands")
 
@@ -95,7 +95,7 @@ class RobotContext(msgspec.Struct, frozen=True):
     raw_ms, suspended_s: see the functions.
     """
 
-    robot: Robot
+    robot: RobotSide
     keys: KeySpace
     bus: Bus
     metrics: Metrics

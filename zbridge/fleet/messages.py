@@ -160,8 +160,9 @@ class Raw(FleetMessage, frozen=True):
 
 
 class LinkStatus(msgspec.Struct, frozen=True):
-    """One transport connection to the robot. shared: gateways of other robots may connect to the same address; left out
-    where they may not.
+    """One transport connection to the robot.
+
+    shared: gateways of other robots may connect to the same address; left out where they may not.
     """
 
     name: str

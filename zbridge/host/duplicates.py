@@ -145,8 +145,9 @@ class Duplicates:
         return next((link for link, each in reversed(self._links.items()) if each.name == name), None)
 
     def descriptor(self, link: int, at: int) -> int | None:
-        """Give a descriptor of a link: 0 its stream's, 1 that of datagrams; None where there is none, or half a frame
-        was written.
+        """Give a descriptor of a link: 0 its stream's, 1 that of datagrams.
+
+        None where there is none, or half a frame was written.
         """
         duplicate = self._links.get(link)
         return duplicate.descriptor(at) if duplicate is not None and duplicate.boundary.outgoing else None

@@ -55,9 +55,9 @@ class Shared(msgspec.Struct, frozen=True, tag="shared"):
 
 
 class Deposited(msgspec.Struct, frozen=True, tag="kept"):
-    """A deposit was written to the shared memory: what a successor needs if this process dies, as MessagePack
-    (:class:`HandoverState` of the handover).
+    """A deposit was written to the shared memory: what a successor needs if this process dies.
 
+    It is MessagePack (:class:`HandoverState` of the handover).
     sockets: the numbers of the links and of their descriptors, in the order of the parcel. area, size: where it is in
     the memory. Without sockets nobody could resume.
     """
@@ -88,8 +88,10 @@ class Started(msgspec.Struct, frozen=True, tag="started"):
 
 
 class Fork(msgspec.Struct, frozen=True, tag="fork"):
-    """Fork a gateway. Descriptors come along: its end of the channel, the content of its file, and the socket from
-    which it takes over, if it does.
+    """Fork a gateway.
+
+    Descriptors come along: its end of the channel, the content of its file, and the socket from which it takes over, if
+    it does.
     """
 
     file: str

@@ -38,8 +38,8 @@ ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THRE
 """Variables for numpy's libraries, to be set before they are loaded: they must start no threads."""
 
 
-class Stamp:
-    """What is installed now. Two stamps are equal if no file of the code differs in size and time of change."""
+class Installation:
+    """What is installed now. Two are equal if no file of the code differs in size and time of change."""
 
     def __init__(self) -> None:
         digest, newest_ns = hashlib.blake2b(digest_size=16), 0
@@ -56,11 +56,11 @@ class Stamp:
         """Whether nothing changed for :data:`SETTLED_S`."""
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Stamp) and self.digest == other.digest
+        return isinstance(other, Installation) and self.digest == other.digest
 
     @classmethod
-    def of(cls, digest: bytes) -> Stamp:
-        """Make the stamp of an installation that was checked before."""
+    def of(cls, digest: bytes) -> Installation:
+        """Make one that was checked before, from its digest."""
         stamp = cls.__new__(cls)
         stamp.digest, stamp.settled = digest, True
         return stamp
@@ -68,7 +68,7 @@ class Stamp:
     __hash__ = None  # type: ignore[assignment]
 
     def __repr__(self) -> str:
-        return f"<Stamp {self.digest.hex()[:8]}>"
+        return f"<Installation {self.digest.hex()[:8]}>"
 
 
 def _files() -> list[Path]:
@@ -119,7 +119,7 @@ class _Adopted:
 class _Server:
     """One running fork server. Answers come in the order of the requests."""
 
-    def __init__(self, process: subprocess.Popen[bytes] | _Adopted, channel: FdChannel, stamp: Stamp) -> None:
+    def __init__(self, process: subprocess.Popen[bytes] | _Adopted, channel: FdChannel, stamp: Installation) -> None:
         self.stamp = stamp
         self.alive = True
         self._process = process
@@ -128,7 +128,7 @@ class _Server:
         asyncio.get_running_loop().add_reader(channel.fileno(), self._receive)
 
     @classmethod
-    def start(cls, command: Sequence[str], stamp: Stamp) -> _Server:
+    def start(cls, command: Sequence[str], stamp: Installation) -> _Server:
         """Start one; raise OSError."""
         channel, far = FdChannel.pair()
         environment = {**os.environ, **ONE_THREAD}
@@ -151,7 +151,7 @@ class _Server:
     @classmethod
     def resume(cls, state: ServerState) -> _Server:
         """Resume one that the code before this one has started."""
-        return cls(_Adopted(state.pid), FdChannel.inherited(state.channel), Stamp.of(state.stamp))
+        return cls(_Adopted(state.pid), FdChannel.inherited(state.channel), Installation.of(state.stamp))
 
     @property
     def pid(self) -> int:
@@ -219,12 +219,12 @@ class _Server:
 
 
 class ForkClient:
-    """ForkClient gateways by the code that is installed now. One request at a time."""
+    """Forks gateways by the code that is installed now. One request at a time."""
 
     def __init__(self, command: Sequence[str]) -> None:
         self._command = command
         self._server: _Server | None = None
-        self._refused: Stamp | None = None
+        self._refused: Installation | None = None
         """The installation whose fork server did not start."""
         self._leaving: list[_Server | _Adopted] = []
         self.unsettled = False
@@ -241,7 +241,7 @@ class ForkClient:
         return self._server.pid if self._server is not None else None
 
     @property
-    def stamp(self) -> Stamp | None:
+    def stamp(self) -> Installation | None:
         """The installation that the fork server loaded."""
         return self._server.stamp if self._server is not None else None
 
@@ -296,12 +296,12 @@ class ForkClient:
     async def _renew(self) -> None:
         self._checked_at = asyncio.get_running_loop().time()
         self._leaving = [each for each in self._leaving if not each.ended]
-        old, stamp = self._server, await asyncio.to_thread(Stamp)
+        old, stamp = self._server, await asyncio.to_thread(Installation)
         if old is not None and old.alive:
             if stamp == old.stamp:
                 self._refused = None
             self.unsettled = stamp != old.stamp and not stamp.settled
-            if stamp == old.stamp or stamp == self._refused or not stamp.settled:
+            if stamp in (old.stamp, self._refused) or not stamp.settled:
                 return
             log.info("the installation has changed: its code is loaded")
         try:
@@ -342,7 +342,7 @@ def _in_memory(content: bytes) -> Iterator[int]:
         os.close(descriptor)
 
 
-async def _started(command: Sequence[str], stamp: Stamp) -> _Server:
+async def _started(command: Sequence[str], stamp: Installation) -> _Server:
     """Start a fork server and wait until it can fork; raise NotReady with the reason."""
     try:
         server = _Server.start(command, stamp)

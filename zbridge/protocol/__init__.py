@@ -1,8 +1,10 @@
-"""What the author of a protocol imports, beside :mod:`zbridge.wire` (messages as bytes) and :mod:`zbridge.fleet`
-(messages on the bus). Sans-IO: knows no event loop, socket, clock, bus, and no robot in particular.
+"""What the author of a protocol imports.
+
+Beside it :mod:`zbridge.wire` (messages as bytes) and :mod:`zbridge.fleet` (messages on the bus). Sans-IO: knows no
+event loop, socket, clock, bus, and no robot in particular.
 
 =============== ===================================================================================================
-plugin          :class:`Protocol`: what an entry point names. :class:`Robot` and :class:`HqSide`: its two sides, with
+plugin          :class:`Protocol`: what an entry point names. :class:`RobotSide` and :class:`HqSide`: its sides, with
                 :class:`Outcome`, :data:`Telemetry`, :data:`Translate` and :data:`Send`; :class:`RobotUser`: what a
                 side may do for a client every ``ATTEND_S`` seconds.
                 :class:`Simulation`, :class:`HqSimulation`: how its simulators are started.
@@ -61,7 +63,7 @@ from zbridge.protocol.plugin import (
     HqSimulation,
     Outcome,
     Protocol,
-    Robot,
+    RobotSide,
     RobotUser,
     Send,
     Simulation,
@@ -121,7 +123,7 @@ __all__ = [
     "ProtocolError",
     "RateLimit",
     "Refused",
-    "Robot",
+    "RobotSide",
     "RobotUser",
     "Role",
     "SampleKind",

@@ -197,8 +197,7 @@ class DeviceClock(Kept):
         low_ns = offset_ns - self._drift_ppm * now_ms
         if low_ns < self._lowest_ns:
             self._lowest, self._lowest_ns = (now_ms, offset_ns), low_ns
-        if low_ns < self._height_ns:
-            self._height_ns = low_ns
+        self._height_ns = min(self._height_ns, low_ns)
 
     def _open_bucket(self, now_ms: int, offset_ns: int) -> None:
         self._lowest = (now_ms, offset_ns)

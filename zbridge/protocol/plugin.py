@@ -41,7 +41,7 @@ class Outcome(msgspec.Struct, frozen=True):
     left_out: str | None = None
 
 
-class Robot(Kept, ABC):
+class RobotSide(Kept, ABC):
     """One robot as its protocol sees it: makes the sessions of its links, and translates both ways. Sans-IO.
 
     Commands are put into the outbox of the sessions that this object made. The time is an argument.
@@ -272,7 +272,7 @@ class Protocol(msgspec.Struct, frozen=True):
     """``[device.options]``."""
     links: int
     """Most links of a robot."""
-    robot: Callable[[Any, int, Metrics], Robot]
+    robot: Callable[[Any, int, Metrics], RobotSide]
     """``robot(options, links, metrics)``: the device side of a robot with so many links (1 to ``Protocol.links``)."""
     simulate: Callable[[Simulation], Coroutine[Any, Any, None]]
     """Run a simulated robot until cancelled."""

@@ -111,7 +111,7 @@ class Session(KeptSession, ABC, Generic[M]):
         """Handle a message of the handshake, or of a class in ``handled``; True hands it on to the translator."""
 
     def claims(self, datagram: bytes, port: int) -> bool:
-        """True: this datagram is from the peer. Asked for a port of the peer's host that is nobody's source yet."""
+        """Tell whether a datagram from a port of the peer's host that is nobody's source yet is from the peer."""
         return False
 
     def rivalled(self, now: float) -> None:

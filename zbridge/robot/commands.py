@@ -188,7 +188,7 @@ class Commands:
         try:
             outcome = self._robot.command(topic, command, now)
             if outcome is None:
-                raise TypeError("Robot.command gave no Outcome")
+                raise TypeError("RobotSide.command gave no Outcome")
         except (Refused, PayloadError, EncodeError):
             raise
         except Exception as error:

@@ -31,7 +31,7 @@ from zbridge.lease.lease_holder import raw_ms
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import DeviceAddress
 from zbridge.protocol.kept import Budget, Exported
-from zbridge.protocol.plugin import Robot
+from zbridge.protocol.plugin import RobotSide
 from zbridge.protocol.session import Datagram, Session, State
 from zbridge.protocol.session_kept import PARTIAL
 from zbridge.protocol.session_table import SessionTable
@@ -72,7 +72,7 @@ class Device:
 
     def __init__(
         self,
-        robot: Robot,
+        robot: RobotSide,
         addresses: tuple[DeviceAddress, ...],
         *,
         protocol: str,

@@ -9,7 +9,7 @@ import msgspec
 from zbridge.errors import FAULT, ConfigError, describe
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import DeviceAddress
-from zbridge.protocol.plugin import Protocol, Robot
+from zbridge.protocol.plugin import Protocol, RobotSide
 
 
 class DeviceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -35,7 +35,7 @@ class DevicePlan(msgspec.Struct, frozen=True):
     addresses: tuple[DeviceAddress, ...]
     shares: bool = False
 
-    def make_robot(self, metrics: Metrics) -> Robot:
+    def make_robot(self, metrics: Metrics) -> RobotSide:
         """Make the device side; raise ConfigError where the protocol's own code cannot."""
         try:
             return self.protocol.robot(self.options, len(self.addresses), metrics)

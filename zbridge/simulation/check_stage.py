@@ -19,7 +19,7 @@ from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
-from zbridge.protocol.plugin import Protocol, Robot, Simulation
+from zbridge.protocol.plugin import Protocol, RobotSide, Simulation
 from zbridge.protocol.session import Session, State
 from zbridge.transport import Conversation, connect
 
@@ -95,7 +95,7 @@ class Transcript(msgspec.Struct):
     unanswered: int = 0
 
 
-def robot_of(protocol: Protocol) -> Robot:
+def robot_of(protocol: Protocol) -> RobotSide:
     """Make the device side as it fits the simulated robot."""
     return protocol.robot(msgspec.convert(protocol.simulated, protocol.options), protocol.links, Metrics())
 

@@ -190,7 +190,7 @@ class FragileServer(FragilePeer):
         """Begin to serve a connection."""
 
     def _free(self) -> bool:
-        """True if the next connection is to be served."""
+        """Tell whether the next connection is to be served."""
         return False
 
     def _bind(self, host: str, port: int, sockets: contextlib.ExitStack) -> socket.socket:

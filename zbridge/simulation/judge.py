@@ -19,8 +19,9 @@ class Ended(Exception):
 
 
 class Bounds(TypedDict, total=False):
-    """What every judge takes. ``keep``: most entries of each list, default its ``KEEP``; ``note``: called with each
-    violation.
+    """What every judge takes.
+
+    ``keep``: most entries of each list, default its ``KEEP``; ``note``: called with each violation.
     """
 
     keep: int

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections import deque
 
+LEAST_S = 1e-9
+"""What a write has waited for at the moment when it is made, by any clock: 0 would mean that nothing waits."""
 ENTRIES = 1024
 """Writes with a time of their own; a write beyond takes the time of the last one."""
 
@@ -33,6 +35,10 @@ class Backlog:
         self._entries.append((self._written, now))
         if self.since is None:
             self.since = now
+
+    def waited_s(self, now: float) -> float:
+        """Return for how long the oldest write has waited; 0 only if there is none, though the clock may stand."""
+        return max(now - self.since, LEAST_S) if self.since is not None else 0.0
 
     def settle(self, outstanding: int) -> None:
         """Remove the acknowledged writes: all but the last ``outstanding`` bytes."""

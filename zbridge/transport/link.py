@@ -29,7 +29,7 @@ class Receiver(Protocol):
         """Take a datagram from the peer."""
 
     def claims(self, datagram: bytes, port: int) -> bool:
-        """True: this datagram is from the peer. Asked for a port of the peer's host that is nobody's source yet."""
+        """Tell whether a datagram from a port of the peer's host that is nobody's source yet is from the peer."""
 
     def rivalled(self) -> None:
         """React to a second source, or a second receiver, with the same claim: the peer has no source any more."""
@@ -80,7 +80,8 @@ class Link(Protocol):
     def unacknowledged_s(self) -> float:
         """Seconds for which the oldest written byte has waited for its acknowledgement.
 
-        Exact above :data:`STALLED_S`; below, the byte may be acknowledged already. 0 where the platform does not tell.
+        Exact above :data:`STALLED_S`; below, the byte may be acknowledged already. 0 only where nothing waits, or where
+        the platform does not tell.
         """
 
     def pause(self) -> None:

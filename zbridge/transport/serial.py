@@ -105,7 +105,7 @@ class SerialLink:
         now = time.monotonic()
         if now - backlog.since > STALLED_S:
             backlog.settle(self._unsent())
-        return now - backlog.since if backlog.since is not None else 0.0
+        return backlog.waited_s(now)
 
     def pause(self) -> None:
         """Read nothing until :meth:`resume`."""

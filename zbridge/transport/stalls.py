@@ -23,7 +23,7 @@ class Stalls:
         return f"<Stalls {'blocked' if self.blocked else 'none'}>"
 
     def takes(self, link: Link) -> bool:
-        """True if the link is not stalled. A stall ends when the last byte is acknowledged."""
+        """Tell whether the link is not stalled. A stall ends when the last byte is acknowledged."""
         waited_s = link.unacknowledged_s
         blocked = waited_s > (0.0 if self.blocked else STALLED_S)
         if blocked is not self.blocked:

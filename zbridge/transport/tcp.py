@@ -151,7 +151,7 @@ class TcpLink(asyncio.BufferedProtocol):
         now = self._kernel.monotonic()
         if now - backlog.since > STALLED_S:
             backlog.settle(outstanding(transport, self._kernel))
-        return now - backlog.since if backlog.since is not None else 0.0
+        return backlog.waited_s(now)
 
     def pause(self) -> None:
         """Read nothing until :meth:`resume`."""

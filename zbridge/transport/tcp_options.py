@@ -52,7 +52,7 @@ _unwatched_warned = False
 
 def new_backlog(sock: socket.socket, kernel: Kernel) -> Backlog | None:
     """Make a backlog if the platform tells what is unacknowledged; else warn once and return None."""
-    global _unwatched_warned
+    global _unwatched_warned  # noqa: PLW0603
     try:
         kernel.unacknowledged(sock)
     except OSError:

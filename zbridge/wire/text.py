@@ -1,6 +1,6 @@
-"""The text codec: the declarations of :mod:`zbridge.wire.fields` as numbers between separators. Sans-IO.
+r"""The text codec: the declarations of :mod:`zbridge.wire.fields` as numbers between separators. Sans-IO.
 
-Read: a field is every match of ``-?[0-9]*\\.?[0-9]+``; all other bytes separate. Written: integers, floats with six
+Read: a field is every match of ``-?[0-9]*\.?[0-9]+``; all other bytes separate. Written: integers, floats with six
 decimals and never an exponent, truth as 1 or 0. A message may have one array, which takes the fields the others leave.
 """
 

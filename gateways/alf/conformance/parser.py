@@ -96,7 +96,7 @@ class ParsedAlfMessage(msgspec.Struct, frozen=True):
 
 def deadly(number: str) -> str:
     """Tell why std::stoi throws at a number, empty if it does not ("The gateway as vehicle")."""
-    whole = number.split(".")[0]
+    whole = number.split(".", maxsplit=1)[0]
     if whole in ("", "-"):
         return f"a number without leading digit, {number[:20]}"
     if len(whole.lstrip("-0")) > _MOST_DIGITS or not -MAX_INT - 1 <= integer(whole) <= MAX_INT:
@@ -106,7 +106,7 @@ def deadly(number: str) -> str:
 
 def integer(number: str) -> int:
     """Read the part before the point as std::stoi does, with any number of leading zeros."""
-    whole = number.split(".")[0]
+    whole = number.split(".", maxsplit=1)[0]
     return (-1 if whole.startswith("-") else 1) * int(whole.lstrip("-0") or "0")
 
 

@@ -239,7 +239,7 @@ class StrictRobot(Judge):
         return CDR + body
 
     def _map(self) -> bytes:
-        """The left half is free, the right half unknown, the last row occupied."""
+        """Draw a map whose left half is free, right half unknown, and last row occupied."""
         body = self._header(b"map")
         body += bytes(-len(body) % 4) + struct.pack("<iIfII", 0, 0, CELL_M, SIDE, SIDE)
         body += bytes(-len(body) % 8) + struct.pack("<7d", -2.0, -2.0, 0, 0, 0, 0, 1)

@@ -110,7 +110,7 @@ class FragileRobot(FragileServer):
     # TCP
 
     def _free(self) -> bool:
-        """True with ``again`` once the connection before has ended ("One usable connection per start")."""
+        """Tell, with ``again``, whether the connection before has ended ("One usable connection per start")."""
         return self._quirks.again and self._conn is None
 
     def _begin(self, conn: socket.socket) -> None:
@@ -353,7 +353,7 @@ class FragileRobot(FragileServer):
             self._start(self._send_parts(self._conn))
 
     def _loses(self) -> bool:
-        """True if the connection is a poor one and loses the packet."""
+        """Tell whether the connection is a poor one and loses the packet."""
         return self._poor and self._chance["loss"].random() < 0.5
 
     # Motion, maps, talk

@@ -77,13 +77,13 @@ class ClientSource(Kept):
         return f"<ClientSource of {self._client_id}: {self._port if self.bound else 'none'}>"
 
     def claims_probe(self, datagram: bytes, port: int) -> bool:
-        """True for a 5 with the client's id or an unassigned one."""
+        """Claim a 5 with the client's id or an unassigned one."""
         sender_id, packet_id = _header(datagram)
         own = sender_id == self._client_id or sender_id in _UNASSIGNED
         return self._claim(port) if own and packet_id == _PROBE else False
 
     def claims_late(self, datagram: bytes, port: int) -> bool:
-        """True for a packet with the client's id from its port, unless that is its source or was contested."""
+        """Claim a packet with the client's id from its port, unless that is its source or was contested."""
         if port != self.client_port or self._contested or (self.bound and self._port == port):
             return False
         sender_id, packet_id = _header(datagram)
@@ -103,7 +103,7 @@ class ClientSource(Kept):
         return _header(datagram)[0]
 
     def accepts_sender(self, sender_id: int) -> bool:
-        """True for the ``id`` bytes of the client's datagrams, and for -1, which decoding will refuse."""
+        """Accept the ``id`` bytes of the client's datagrams, and -1, which decoding will refuse."""
         return sender_id in (_NO_HEADER[0], self._client_id, *_UNASSIGNED)
 
     def _claim(self, port: int) -> bool:

@@ -100,7 +100,7 @@ async def asked(restarts: Restarts, bus: FakeBus, key: str = ASKED) -> Any:
     """Ask for a restart, and let the answer be worked on."""
     entry = restarts.answer(bus)
     queries: list[Any] = []
-    ((_, handler, _),) = bus._shared.queryables
+    ((_, handler, _),) = bus.network.queryables
     from zbridge.bus.fake import FakeQuery
 
     queries.append(FakeQuery(ASKED, asked=key))

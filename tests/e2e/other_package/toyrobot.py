@@ -17,7 +17,7 @@ from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.protocol.codec import Codec
-from zbridge.protocol.plugin import Outcome, Protocol, Robot, Simulation, Telemetry, Translate
+from zbridge.protocol.plugin import Outcome, Protocol, RobotSide, Simulation, Telemetry, Translate
 from zbridge.protocol.session import Limits, Role, Session
 
 TEMPLATE = """\
@@ -75,7 +75,7 @@ class ToySession(Session[At]):
         return True
 
 
-class ToyRobot(Robot):
+class ToyRobot(RobotSide):
     link_names = ("robot",)
 
     def __init__(self, options: Options, links: int, metrics: Metrics) -> None:
@@ -90,9 +90,9 @@ class ToyRobot(Robot):
         return self._session
 
     def translator(self, kind: type) -> Translate:
-        return self._at
+        return self.pose
 
-    def _at(self, message: At, stamp_ns: int) -> Iterable[Telemetry]:
+    def pose(self, message: At, stamp_ns: int) -> Iterable[Telemetry]:
         return ((topics.POSE, Pose(message.x, message.y, message.heading, stamp_ns=stamp_ns)),)
 
     def command(self, topic: Topic, command: FleetMessage, now: float) -> Outcome:

@@ -50,7 +50,7 @@ def test_a_serial_line_leads_to_no_router() -> None:
 def test_defaults_are_what_the_template_says() -> None:
     import tomllib
 
-    import gateways.ros2 as ros2
+    from gateways import ros2
 
     lines = [line.removeprefix("# ") for line in ros2.TEMPLATE.splitlines()]
     written = tomllib.loads("\n".join(lines))["device"]["options"]

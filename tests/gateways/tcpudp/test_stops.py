@@ -207,7 +207,7 @@ async def stop_by(cause: str, rig: Rig) -> None:
         case "reconnection":
             rig.goes()
             await asyncio.sleep(2.0)
-            rig._read = 0  # the new link's
+            rig.read_to = 0  # the new link's
             rig.sends(SETTINGS["1.3"])
 
 

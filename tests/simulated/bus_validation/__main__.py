@@ -9,7 +9,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from tests.e2e.processes import go_apart
+from tests.e2e.rigs.processes import go_apart
 from tests.simulated.bus_validation import played_model, played_real
 from tests.simulated.bus_validation.played_real import Played
 from tests.simulated.bus_validation.trace import Finding, Trace

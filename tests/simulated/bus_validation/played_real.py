@@ -14,7 +14,7 @@ import time
 from typing import Any, NamedTuple
 
 from tests.e2e.conftest import until
-from tests.e2e.processes import Part, Road
+from tests.e2e.rigs.processes import Part, Road
 from tests.machine import Withheld
 from tests.ports import free_port
 from tests.simulated.bus_validation.trace import Entry, Log, Step, Trace

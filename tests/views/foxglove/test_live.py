@@ -39,7 +39,7 @@ class Scene:
     def keys(self) -> list[str]:
         """Give the keys and expressions that are subscribed to, but those of the server itself."""
         own = ("fleet/*/devices", "fleet/*/control")
-        return sorted(key for key, _ in self.bus._shared.subscribers if key not in own)
+        return sorted(key for key, _ in self.bus.network.subscribers if key not in own)
 
     def put(self, topic: Topic, message: FleetMessage | bytes) -> None:
         payload = message if isinstance(message, bytes) else encode(message)

@@ -160,7 +160,7 @@ async def test_a_gateway_that_claims_the_name_later_waits(recording: Path) -> No
 async def test_nothing_is_left_on_the_bus(recording: Path) -> None:
     async with Stage(recording).running() as stage:
         pass
-    assert stage.bus._shared.tokens == []
+    assert stage.bus.network.tokens == []
     assert await stage.bus.ask("fleet/again/*") == []
 
 

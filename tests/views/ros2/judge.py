@@ -67,8 +67,12 @@ class Ros:
                 self.store.register(get_types_from_msg(text, f"{service.replace('/srv/', '/msg/')}_{part}"))
         self._numbers = itertools.count(1)
         names = (namespace.replace("/", "%") or "%", name)
-        self._place = f"{self.session.zid()}/0", f"%/{'/'.join(names)}"
-        self._kept: list[Any] = [self._token(f"{self._place[0]}/0/NN/{self._place[1]}")]
+        self.place = f"{self.session.zid()}/0", f"%/{'/'.join(names)}"
+        self._kept: list[Any] = [self._token(f"{self.place[0]}/0/NN/{self.place[1]}")]
+
+    def declare(self, rest: str) -> None:
+        """Declare a token until the end."""
+        self._kept.append(self._token(rest))
 
     def _token(self, rest: str) -> Any:
         return self.session.liveliness().declare_token(f"@ros2_lv/{self.domain}/{rest}")
@@ -78,16 +82,16 @@ class Ros:
             return "TypeHashNotSupported"
         return SERVICE_HASHES.get(type_name) or self.store.hash_rihs01(type_name)
 
-    def _names(self, topic: str, type_name: str) -> tuple[str, str]:
+    def names(self, topic: str, type_name: str) -> tuple[str, str]:
         """Return the key of a topic, and the part of a token that names it."""
         package, kind, name = type_name.split("/")
         shown, hashed = f"{package}::{kind}::dds_::{name}_", self._hash(type_name)
         return f"{self.domain}/{topic.strip('/')}/{shown}/{hashed}", f"{topic.replace('/', '%')}/{shown}/{hashed}"
 
     def _endpoint(self, kind: str, topic: str, type_name: str, qos: str) -> tuple[str, str]:
-        key, named = self._names(topic, type_name)
-        token = f"{self._place[0]}/{next(self._numbers)}/{kind}/{self._place[1]}/{named}/{qos}"
-        self._kept.append(self._token(token))
+        key, named = self.names(topic, type_name)
+        token = f"{self.place[0]}/{next(self._numbers)}/{kind}/{self.place[1]}/{named}/{qos}"
+        self.declare(token)
         return key, f"@ros2_lv/{self.domain}/{token}"
 
     def subscribe(

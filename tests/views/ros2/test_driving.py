@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from tests.bounds import most_kept
 from zbridge.views.ros2.driving import PUBLISHERS, REMEMBERED, TABLE, Action, Driving, Event, Standing
 
 A, B = b"a" * 16, b"b" * 16
@@ -173,4 +174,4 @@ def test_publishers_and_memories_are_bounded() -> None:
         driving.came(gid, "/x", 0, early=False)
         driving.gone(gid)
     assert not driving.publishers
-    assert len(driving._gone) == REMEMBERED
+    assert most_kept(driving) == REMEMBERED

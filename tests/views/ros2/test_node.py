@@ -19,6 +19,7 @@ from zbridge.metrics import Metrics
 from zbridge.ros2 import read_attachment, types_of
 from zbridge.views.ros2.node import RobotNode
 from zbridge.views.ros2.outlets import RosSide
+from zbridge.views.ros2.pictures import RosPictures
 from zbridge.views.ros2.settings import RobotBody
 
 COUNT = 300
@@ -49,18 +50,22 @@ class Scene:
 
     def listen(self, name: str, anybody: bool = True) -> None:
         """Let somebody listen to a topic, or nobody any more."""
-        for outlet in self.node._outlets[name]:
-            self.node._on_listened(name, outlet, anybody)
+        for notify in self.notifiers(name):
+            notify(anybody)
+
+    def notifiers(self, name: str) -> list[Callable[[bool], None]]:
+        """Give what is called when somebody begins or ends to listen to a topic."""
+        return [notify for key, notify in self.ros.network.listened if key.startswith((f"0/r1/{name}/", f"0/{name}/"))]
 
     def put(self, path: str, payload: bytes) -> None:
         """Let the robot publish; the fake bus calls whoever subscribed on this thread."""
-        for key_expr, handler in tuple(self.fleet._shared.subscribers):
+        for key_expr, handler in tuple(self.fleet.network.subscribers):
             if key_expr == f"fleet/r1/{path}":
                 handler(Sample(key_expr, payload))
 
     def numbers(self, name: str) -> list[int]:
         """Give the numbers of what was put on a topic, in order."""
-        shown = [sample.attachment for sample in self.ros._shared.history if sample.key.startswith(f"0/r1/{name}/")]
+        shown = [sample.attachment for sample in self.ros.network.history if sample.key.startswith(f"0/r1/{name}/")]
         return [read_attachment(attachment).number for attachment in shown]
 
 
@@ -93,7 +98,7 @@ async def test_nothing_is_read_that_nobody_listens_to(scene: Scene) -> None:
     scene.listen("scan", False)
     scene.put("scan", SCAN)
     assert scene.numbers("scan") == [1]
-    read = {key for key, _ in scene.fleet._shared.subscribers}
+    read = {key for key, _ in scene.fleet.network.subscribers}
     assert read == {"fleet/r1/devices"}
 
 
@@ -126,18 +131,18 @@ async def test_a_stream_of_another_thread_is_put_in_order_while_listeners_come_a
 async def test_who_listens_does_not_change_while_a_message_is_made(scene: Scene, monkeypatch) -> None:
     scene.listen("scan")
     other = threading.Thread(target=scene.listen, args=("tf",))
-    made = scene.node._pictures.make
+    made = RosPictures.make
 
     def make(*given: Any) -> Any:
         other.start()
         other.join(0.05)
-        assert "tf" not in scene.node._listened
+        assert "tf" not in repr(scene.node)
         return made(*given)
 
-    monkeypatch.setattr(scene.node._pictures, "make", make)
+    monkeypatch.setattr(RosPictures, "make", make)
     scene.put("scan", SCAN)
     other.join()
-    assert "tf" in scene.node._listened
+    assert "tf" in repr(scene.node)
     assert scene.numbers("scan") == [1]
 
 
@@ -148,38 +153,40 @@ async def test_what_is_no_message_of_its_key_is_counted_and_left_out(scene: Scen
     assert (scene.numbers("scan"), scene.metrics.total("ros2_malformed")) == ([], 1)
 
 
-def devices(*names: str) -> Sample:
+def devices(*names: str) -> bytes:
     """Make what a robot says of its distance sensors."""
     told = tuple(Device(name=name, number=number, kind="distance") for number, name in enumerate(names))
-    return Sample("fleet/r1/devices", encode(Devices(devices=told)))
+    return encode(Devices(devices=told))
 
 
 async def test_a_robot_whose_sensors_get_other_names_has_topics_of_those_it_has_now(scene: Scene) -> None:
-    scene.node._on_devices(devices("a", "b"))
-    before = len(scene.ros._shared.tokens)
+    scene.put("devices", devices("a", "b"))
+    before = len(scene.ros.network.tokens)
     scene.listen("range/a")
     for number in range(20):
-        scene.node._on_devices(devices(f"a{number}", f"b{number}"))
-    assert len(scene.ros._shared.tokens) == before
-    assert {name for name in scene.node._outlets if name.startswith("range/")} == {"range/a19", "range/b19"}
-    assert "range/a" not in scene.node._listened
+        scene.put("devices", devices(f"a{number}", f"b{number}"))
+    assert len(scene.ros.network.tokens) == before
+    ranges = {key.split("/")[3] for key, _ in scene.ros.network.listened if key.startswith("0/r1/range/")}
+    assert ranges == {"a19", "b19"}
+    assert "range/a" not in repr(scene.node)
 
 
 async def test_what_is_told_after_the_end_declares_nothing(scene: Scene) -> None:
-    outlets = {name: scene.node._outlets[name][0] for name in ("scan", "diagnostics")}
+    notifiers = [notify for name in ("scan", "diagnostics") for notify in scene.notifiers(name)]
+    (take,) = [take for key, take in scene.fleet.network.subscribers if key == "fleet/r1/devices"]
     await scene.node.close()
-    for name, outlet in outlets.items():
-        scene.node._on_listened(name, outlet, True)
-    scene.node._on_devices(devices("ghost"))
-    assert scene.fleet._shared.subscribers == []
-    assert scene.ros._shared.tokens == []
-    assert scene.node._timer is None
+    for notify in notifiers:
+        notify(True)
+    take(Sample("fleet/r1/devices", devices("ghost")))
+    assert scene.fleet.network.subscribers == []
+    assert scene.ros.network.tokens == []
+    assert scene.numbers("diagnostics") == []
 
 
 async def test_readings_of_all_sensors_come_by_one_subscription_each_to_its_topic(scene: Scene) -> None:
-    scene.node._on_devices(devices("a", "b"))
+    scene.put("devices", devices("a", "b"))
     for name in ("range/a", "range/b"):
         scene.listen(name)
-    ((_, take),) = [(key, take) for key, take in scene.fleet._shared.subscribers if key == "fleet/r1/sensor/*"]
+    ((_, take),) = [(key, take) for key, take in scene.fleet.network.subscribers if key == "fleet/r1/sensor/*"]
     take(Sample("fleet/r1/sensor/b", encode(Reading(1.0, "distance", 1))))
     assert (scene.numbers("range/a"), scene.numbers("range/b")) == ([], [1])

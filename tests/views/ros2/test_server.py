@@ -38,7 +38,7 @@ class Scene:
 
     def shown(self) -> set[str]:
         """Give the nodes that ROS sees."""
-        return {token.split("/")[7] for token in self.ros._shared.tokens if "/NN/" in token}
+        return {token.split("/")[7] for token in self.ros.network.tokens if "/NN/" in token}
 
 
 @pytest.fixture
@@ -55,7 +55,7 @@ async def test_a_robot_is_a_node_while_its_gateway_lives(scene: Scene) -> None:
     await asyncio.sleep(HIDDEN_AFTER_S - 0.1)
     assert scene.nodes() == {"r1": "/r1/zbridge"}
     await asyncio.sleep(0.2)
-    assert (scene.nodes(), scene.shown(), scene.ros._shared.queryables) == ({}, set(), [])
+    assert (scene.nodes(), scene.shown(), scene.ros.network.queryables) == ({}, set(), [])
 
 
 async def test_a_gateway_that_comes_back_soon_keeps_its_node(scene: Scene) -> None:
@@ -118,7 +118,7 @@ class Routed(FakeBus):
 
 def test_one_router_for_both_sides_is_refused() -> None:
     planned = plan(Ros2Settings())
-    server._apart(Routed("1", "a"), Routed("2", "b"), planned)
+    server.require_two_routers(Routed("1", "a"), Routed("2", "b"), planned)
     for fleet, ros in ((Routed("1", "a"), Routed("2", "b", "a")), (Routed("1"), Routed("2", "1"))):
         with pytest.raises(ConfigError, match=r"ros = tcp/localhost:7447: the same router as the fleet's"):
-            server._apart(fleet, ros, planned)
+            server.require_two_routers(fleet, ros, planned)

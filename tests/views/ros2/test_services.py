@@ -68,13 +68,13 @@ class Scene:
         self.services = Services(self.side, node, self.robot, drive=drive, on_stop=lambda: told.append("told"))  # type: ignore[arg-type]
 
     def names(self) -> list[str]:
-        return [key.split("/")[2] for key, _, _ in self.bus._shared.queryables]
+        return [key.split("/")[2] for key, _, _ in self.bus.network.queryables]
 
     async def call(self, name: str, payload: bytes = TRIGGER, attachment: bytes | None = BESIDE) -> FakeQuery:
         """Call a service, and let it work."""
         query = FakeQuery("key", payload)
         query.attachment = attachment
-        handler = next(handler for key, handler, _ in self.bus._shared.queryables if f"/{name}/" in key)
+        handler = next(handler for key, handler, _ in self.bus.network.queryables if f"/{name}/" in key)
         handler(query)
         for _ in range(4):
             await asyncio.sleep(0)
@@ -161,7 +161,7 @@ async def test_calls_at_the_same_time_are_bounded_and_end_with_the_services(scen
     scene.robot.goes_on.set()
     await asyncio.sleep(0.001)
     assert [query.replies for query in waiting] == [[]] * AT_ONCE
-    assert (scene.bus._shared.queryables, scene.bus._shared.tokens) == ([], [])
+    assert (scene.bus.network.queryables, scene.bus.network.tokens) == ([], [])
 
 
 async def test_there_is_room_for_a_call_when_another_one_has_ended(scene: Scene) -> None:

@@ -38,6 +38,10 @@ class Scene:
         self.fleet = FakeBus()
         self.teleop = Teleop(self.side, node, robot, RobotBody(), self.fleet, "fleet/r1/control", "ros2")
         self.driving: Any = self.teleop._driving
+        self.takes = dict(self.bus.network.subscribers)
+        """What is called for a sample, by its key; also after the end."""
+        ((_, self.on_token),) = self.bus.network.watchers
+        self.sort: Any = self.bus.network.lanes[self.endpoint().key]
 
     def counted(self, what: str) -> int:
         return self.side.metrics.total(f"ros2_cmd_vel_{what}")
@@ -53,11 +57,11 @@ class Scene:
 
     def put(self, endpoint: Endpoint) -> None:
         beside = Attachment(1, 1, endpoint.gid()).encode()
-        self.teleop._take(TWIST, Sample(endpoint.key, FORWARD, beside))
+        self.takes[endpoint.key](Sample(endpoint.key, FORWARD, beside))
 
     def unheard(self, *tokens: str) -> None:
         """Change the publishers that are there, and tell nobody."""
-        there = self.bus._shared.tokens
+        there = self.bus.network.tokens
         there[:] = [*(token for token in there if "/MP/" not in token), *tokens]
 
 
@@ -109,7 +113,7 @@ async def test_a_publisher_that_goes_while_the_answer_is_on_its_way_is_not_enter
     endpoint = scene.endpoint()
 
     async def alive(_: str) -> list[str]:
-        scene.bus._shared.tell(endpoint.token(), False)
+        scene.bus.network.notify(endpoint.token(), False)
         return [endpoint.token()]
 
     monkeypatch.setattr(scene.bus, "alive", alive)
@@ -142,7 +146,7 @@ async def test_a_stick_that_was_held_while_ros_s_router_was_away_owes_whatever_w
     await asyncio.sleep(2.0)
     assert scene.driving.publishers == {}
     scene.teleop.connected(True)
-    scene.teleop._on_token(stick.token(), True)
+    scene.on_token(stick.token(), True)
     scene.put(stick)
     assert [each.standing for each in scene.driving.publishers.values()] == [Standing.OWES]
     await scene.teleop.close()
@@ -170,7 +174,7 @@ async def test_what_a_known_publisher_sends_is_taken_at_a_bounded_rate_and_stran
 
     def lanes(endpoint: Endpoint, count: int) -> int:
         beside = Attachment(1, 1, endpoint.gid()).encode()
-        taken = [scene.teleop._sort(len(FORWARD), "key", beside, len(FORWARD), lambda: FORWARD) for _ in range(count)]
+        taken = [scene.sort("key", beside, len(FORWARD), lambda: FORWARD) for _ in range(count)]
         assert set(taken) <= {Lane.OTHER, None}
         return sum(lane is not None for lane in taken)
 
@@ -181,14 +185,14 @@ async def test_what_a_known_publisher_sends_is_taken_at_a_bounded_rate_and_stran
     scene.driving.holder = known.gid()
     await asyncio.sleep(1.0)
     beside = Attachment(1, 1, known.gid()).encode()
-    assert scene.teleop._sort(len(FORWARD), "key", beside, len(FORWARD), lambda: FORWARD) is Lane.COMMAND
+    assert scene.sort("key", beside, len(FORWARD), lambda: FORWARD) is Lane.COMMAND
     await scene.teleop.close()
 
 
-@pytest.mark.parametrize(("beside", "size"), [(None, 52), (bytes(32), 52), (bytes(34), 52), (bytes(33), 52 + 34)])
+@pytest.mark.parametrize(("beside", "size"), [(None, 52), (bytes(32), 52), (bytes(34), 52), (bytes(33), 64 + 34)])
 async def test_what_is_no_command_by_its_size_is_dropped_and_counted(beside: bytes | None, size: int) -> None:
     scene = Scene()
-    assert scene.teleop._sort(52, "key", beside, size, lambda: b"") is None
+    assert scene.sort("key", beside, size, lambda: b"") is None
     assert (scene.counted("malformed"), scene.counted("strangers")) == (1, 0)
     await scene.teleop.close()
 
@@ -199,7 +203,7 @@ async def test_tokens_of_other_types_are_counted_and_shown_until_they_go() -> No
     wrong = Endpoint(node, 7, Kind.PUBLISHER, "/r1/cmd_vel", "std_msgs/msg/String", "RIHS01_0")
     other = Endpoint(node, 8, Kind.PUBLISHER, "/r1/cmd_vel", TWIST, "RIHS01_0")
     handles = [scene.bus.announce(each.token()) for each in (wrong, other)]
-    scene.teleop._on_token("@ros2_lv/what", True)
+    scene.on_token("@ros2_lv/what", True)
     told = scene.teleop.diagnostics()
     assert told.level == WARN
     assert [value for name, value in told.values if name == "refused"] == [
@@ -227,7 +231,7 @@ async def test_a_robot_that_somebody_stops_is_owed_a_zero_by_its_publishers() ->
     assert told.level == WARN
     assert "the robot was stopped: send a zero, or nothing for a second, then drive" in told.message
     publisher.close()
-    assert scene.fleet._shared.subscribers == [], "without publishers nobody looks"
+    assert scene.fleet.network.subscribers == [], "without publishers nobody looks"
     await scene.teleop.close()
 
 
@@ -247,7 +251,7 @@ async def test_garbage_of_a_publisher_is_counted_and_moves_nothing() -> None:
     endpoint = scene.endpoint()
     scene.bus.announce(endpoint.token())
     for beside, payload in ((b"?", FORWARD), (Attachment(1, 1, endpoint.gid()).encode(), FORWARD[:20])):
-        scene.teleop._take(TWIST, Sample(endpoint.key, payload, beside))
+        scene.takes[endpoint.key](Sample(endpoint.key, payload, beside))
     assert scene.counted("malformed") == 2
     assert scene.driving.holder is None
     await scene.teleop.close()

@@ -1,5 +1,6 @@
-"""What a handover needs of the operating system: the socket between two processes, the end of the other process, and a
-successor that is started, with a supervisor or, as here, without one.
+"""What a handover needs of the operating system, with a supervisor or, as here, without one.
+
+That is the socket between two processes, the end of the other process, and a successor that is started.
 
 A simulation injects its own processes in the place of :data:`PROCESSES`.
 """

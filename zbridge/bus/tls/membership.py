@@ -1,5 +1,6 @@
-"""Whether the router knows our name: it lets every certificate of its authority connect, and an unknown name hears
-silence.
+"""Whether the router knows our name.
+
+A router lets every certificate of its authority connect, and sends nothing to a name that it does not know.
 
 ``zbridge router`` answers each member who it is, and nobody else may ask (``@bus/whoami/<name>``). Zenoh's own router
 answers nobody: the id of a session tells them apart.

@@ -40,13 +40,13 @@ def prompt(callback: Callable[[Any], object]) -> zenoh.handlers.Callback[Any]:
 
     def called(raw: Any) -> None:
         if not hasattr(_here, "known"):
-            _get_known()
+            keep_thread()
         callback(raw)
 
     return threadless(called)
 
 
-def _get_known() -> None:
+def keep_thread() -> None:
     """Let Python keep its state of this thread, which is not one of its own, for the next call.
 
     Python makes and frees that state, with a stack that is mapped anew, for each call: 20 us. A reference too many,

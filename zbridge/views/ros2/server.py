@@ -37,7 +37,7 @@ async def serve(plan: Ros2Plan, bus: BusSettings, metrics: Metrics, on_ready: Ca
             where = ", ".join(plan.router.connect)
             raise BusError(f"{error}: no ROS router at {where}: `ros2 run rmw_zenoh_cpp rmw_zenohd`") from error
         stack.push_async_callback(ros.close)
-        _apart(fleet, ros, plan)
+        require_two_routers(fleet, ros, plan)
         view = View(plan, fleet, RosSide(ros, plan.domain, types, metrics), own_name(bus.tls))
         stack.push_async_callback(view.close)
         view.start()
@@ -45,7 +45,7 @@ async def serve(plan: Ros2Plan, bus: BusSettings, metrics: Metrics, on_ready: Ca
         await asyncio.Event().wait()
 
 
-def _apart(fleet: Bus, ros: Bus, plan: Ros2Plan) -> None:
+def require_two_routers(fleet: Bus, ros: Bus, plan: Ros2Plan) -> None:
     """Raise ConfigError where both sessions are at one router: a fleet's rules do not know ROS's keys."""
     if set(fleet.routers()) & set(ros.routers()) or fleet.zid in ros.routers():
         where = ", ".join(plan.router.connect)

@@ -26,7 +26,7 @@ class Options(protocol.Differential, frozen=True, kw_only=True):
     track_m: protocol.Positive = 0.053
 
 
-class KheperaRobot(protocol.Robot):
+class KheperaRobot(protocol.RobotSide):
     """One Khepera on one link."""
 
     link_names = ("robot",)

@@ -1,6 +1,6 @@
 """What connections that never become sessions do to a router's TLS port: to those who are in, and to who comes.
 
-    python -m tests.e2e.half_open
+    python -m tests.e2e.measured.half_open
 
 A gateway writes a pose 200 times a second, a viewer hears it, both through one router with mutual TLS. In each round,
 for three seconds each: 1 000 connections come at once and send what is no TLS; 300 connections come at once, say
@@ -29,7 +29,7 @@ from typing import NamedTuple
 import zenoh
 
 from tests.e2e.conftest import HOST, until
-from tests.e2e.secure import ROLES, SecureBus, declared
+from tests.e2e.rigs.secure import ROLES, SecureBus, declared
 
 GARBAGE, HALF_OPEN = 1000, 300
 ROUNDS = 3
@@ -126,7 +126,7 @@ def newcomer_s(bus: SecureBus, attack: str, here: bool) -> float:
 @contextlib.contextmanager
 def attacked(how: str, port: int) -> Iterator[None]:
     """Attack from a process of its own, which ends with the context. port: 0 is a port of its own."""
-    command = [sys.executable, "-m", "tests.e2e.half_open", how, str(port)]
+    command = [sys.executable, "-m", "tests.e2e.measured.half_open", how, str(port)]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as attacker:
         assert attacker.stdout is not None
         attacker.stdout.readline()

@@ -1,7 +1,7 @@
 """Mixed commands through a real gateway against the fragile Webots controller: no violation, and everything arrives.
 
-    python -m tests.e2e.wc2ec_judge                     # both dialects, 2000 commands each
-    python -m tests.e2e.wc2ec_judge --commands 300 --dialect draft
+    python -m tests.e2e.measured.wc2ec_judge                     # both dialects, 2000 commands each
+    python -m tests.e2e.measured.wc2ec_judge --commands 300 --dialect draft
 
 What a robot of the dialect cannot do must be refused and never arrive. Of drives the newest wins, so a few that were
 overtaken are excused; nothing else is.
@@ -9,11 +9,12 @@ overtaken are excused; nothing else is.
 
 from __future__ import annotations
 
+import math
 from typing import Any, ClassVar
 
-from tests.e2e import mixed
-from tests.e2e.mixed import Arrival, Judgement, Put, Run
-from tests.e2e.processes import report
+from tests.e2e.measured import mixed
+from tests.e2e.measured.mixed import Arrival, Judgement, Put, Run
+from tests.e2e.rigs.processes import report
 
 LEFT, RIGHT, LIFT = 8, 9, 10
 """Numbers of the fragile robot's motors."""
@@ -107,7 +108,7 @@ class _Webots(Run):
     def compare(self, report: dict[str, Any]) -> None:
         super().compare(report)
         for arrival in self.arrivals(report):
-            if any(abs(value) >= FORBIDDEN or value != value for value in arrival[2]):
+            if any(abs(value) >= FORBIDDEN or math.isnan(value) for value in arrival[2]):
                 self.judgement.faults.append(f"{arrival} should have been refused")
 
 

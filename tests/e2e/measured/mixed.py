@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 from tests.e2e.conftest import Bench, device, until
-from tests.e2e.fragile import DISTURBED, disturbed, fragile_robot
-from tests.e2e.processes import Finding
+from tests.e2e.rigs.fragile import DISTURBED, disturbed, fragile_robot
+from tests.e2e.rigs.processes import Finding
 
 Arrival = tuple[Any, ...]
 

@@ -1,9 +1,10 @@
 """A node of dora-rs' ROS 2 bridge, an implementation of rmw_zenoh's format in Rust that others wrote. Not of the suite.
 
-``python -m tests.e2e.dora_node ENDPOINT FOLDER`` runs in an environment of its own (dora-rs 1.1.0, pyarrow, rosbags):
-writes types to FOLDER, listens to three robots, drives them by Twist, then by TwistStamped, calls a service of each,
-drives on, and ends while it does. What came is printed as one JSON object a line; monotonic seconds. It imports
-nothing of zbridge. Each topic has a thread of its own. :mod:`tests.e2e.dora_ros2` starts and judges it.
+``python -m tests.e2e.measured.dora_node ENDPOINT FOLDER`` runs in an environment of its own (dora-rs 1.1.0, pyarrow,
+rosbags): writes types to FOLDER, listens to three robots, drives them by Twist, then by TwistStamped, calls a service
+of each, drives on, and ends while it does. What came is printed as one JSON object a line; monotonic seconds. It
+imports nothing of zbridge. Each topic has a thread of its own. :mod:`tests.e2e.measured.dora_ros2` starts and judges
+it.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import rosbags.typesys.store as stores
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from tests.e2e.lines import Lines
+from tests.e2e.rigs.lines import Lines
 
 LISTENED = {
     "/alf/scan": ("sensor_msgs/LaserScan", False),

@@ -1,7 +1,8 @@
 """A supervisor as a part of a scene, whose gateways hang, and die at a step of a restart, when they are told to.
 
-``python -m tests.e2e.supervised FOLDER``: ``zbridge run FOLDER``; its fork server is this module too. A gateway that is
-sent SIGUSR1 blocks its event loop for good. Orders to die are written to the folder beside it (:mod:`.steps`).
+``python -m tests.e2e.rigs.supervised FOLDER``: ``zbridge run FOLDER``; its fork server is this module too. A gateway
+that is sent SIGUSR1 blocks its event loop for good. Orders to die are written to the folder beside it
+(:mod:`tests.e2e.rigs.steps`).
 """
 
 import asyncio
@@ -14,13 +15,14 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from tests.e2e import steps
 from tests.e2e.conftest import WAIT_S, end, until
-from tests.e2e.processes import ROOT, module
+from tests.e2e.rigs import steps
+from tests.e2e.rigs.processes import ROOT, module
 from zbridge.app import until_signal
 from zbridge.cli import set_up_log
 from zbridge.cli.fork_server import run
 from zbridge.host.fd_channel import FdChannel
+from zbridge.host.fork_client import ForkClient
 from zbridge.host.fork_server import Birth, serve
 from zbridge.host.settings import HostSettings
 from zbridge.host.supervisor import Supervisor
@@ -47,7 +49,9 @@ class Supervised:
         self.orders = orders_of(folder)
         self._log = folder.with_suffix(".log")
         command = (
-            module("supervised", folder) if hangs else [sys.executable, "-m", "zbridge", "run", str(folder), *more]
+            module("tests.e2e.rigs.supervised", folder)
+            if hangs
+            else [sys.executable, "-m", "zbridge", "run", str(folder), *more]
         )
         with self._log.open("ab") as log:
             command = [*enter, *command]
@@ -113,8 +117,8 @@ def main() -> None:
     set_up_log(verbose=False)
     folder = Path(sys.argv[1])
     orders_of(folder).mkdir(exist_ok=True)
-    forks = module("supervised", FORKS, orders_of(folder))
-    supervisor = Supervisor((folder,), HostSettings(), forks, watch=False, verbose=False)
+    forks = module("tests.e2e.rigs.supervised", FORKS, orders_of(folder))
+    supervisor = Supervisor((folder,), HostSettings(), ForkClient(forks), watch=False, verbose=False)
     asyncio.run(until_signal(supervisor.run()))
 
 

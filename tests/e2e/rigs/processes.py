@@ -16,13 +16,13 @@ from pathlib import Path
 
 LINE_S = 20.0
 """Longest wait for a line."""
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 _ENDS_WITH_US = ("setpriv", "--pdeathsig", "KILL") if shutil.which("setpriv") else ()
 
 
 def module(name: str, *arguments: object) -> list[str]:
     """Give the command that runs a module of these tests as a part of a scene."""
-    return [sys.executable, "-m", name if "." in name else f"tests.e2e.{name}", *map(str, arguments)]
+    return [sys.executable, "-m", name, *map(str, arguments)]
 
 
 class Part:

@@ -1,6 +1,6 @@
 """Old HQ programs that drive, each as small as can be: plain sockets, bytes written by hand, a process each.
 
-    python -m tests.e2e.hq_programs PROGRAM HOST PORT
+    python -m tests.e2e.rigs.hq_programs PROGRAM HOST PORT
 
 Each line on stdin is a push of the stick, after letting go of it; the end of stdin is an orderly end. Every motion has
 a value of its own. Only the standard library: such a process must be there at once.

@@ -1,17 +1,17 @@
 """A gateway crashes, or restarts and dies on the way, while its robot is driven: does the robot rest, and stay usable?
 
-    python -m tests.e2e.crossings                                  # everything, 20 times each; about an hour and a half
-    python -m tests.e2e.crossings --times 3 --only 'alf' 'successor after go' --out crossings.jsonl
-    python -m tests.e2e.crossings --list
+    python -m tests.e2e.measured.crossings                     # everything, 20 times each; about an hour and a half
+    python -m tests.e2e.measured.crossings --times 3 --only 'alf' 'successor after go' --out crossings.jsonl
+    python -m tests.e2e.measured.crossings --list
 
 One supervisor (``zbridge run DIR``) runs all gateways, each with a listener. Each repetition has a fragile robot of its
-own, in a process that tells its commanded motion (:mod:`tests.e2e.fragile`) and has a map as large as the field's, a
-robot file that comes while the supervisor runs, an HQ program at the listener, and a driver on the bus. While the robot
-moves, its gateway
+own, in a process that tells its commanded motion (:mod:`tests.e2e.rigs.moving_robot`) and has a map as large as the
+field's, a robot file that comes while the supervisor runs, an HQ program at the listener, and a driver on the bus.
+While the robot moves, its gateway
 
 hung: blocks its event loop for good; frozen: is stopped (SIGSTOP); killed: is killed (SIGKILL);
 restart: is restarted, and both processes come through;
-predecessor, successor: is restarted, and this process dies at this step (:mod:`tests.e2e.steps`), or is frozen there;
+predecessor, successor: is restarted, and this process dies, or is frozen, at this step (:mod:`tests.e2e.rigs.steps`);
 again: is killed, and so is the process that goes on with its connections, at this step.
 
 The time to rest runs from that moment; where the driver may drive on (the successor died early), from the driver's end.
@@ -43,15 +43,15 @@ from typing import Any
 
 import zenoh
 
-from tests.e2e import loss, steps
 from tests.e2e.conftest import HOST, Fleet, configuration, device, end, listener, until
-from tests.e2e.fragile import DISTURBED, ROBOTS, charges
-from tests.e2e.hq_scene import ANSWER
-from tests.e2e.processes import LINE_S, Part
-from tests.e2e.robots import SCALE
-from tests.e2e.stalls import MovingRobot
-from tests.e2e.steps import STEPS, Of, Order
-from tests.e2e.supervised import Supervised
+from tests.e2e.rigs import loss, steps
+from tests.e2e.rigs.fragile import DISTURBED, ROBOTS, charges
+from tests.e2e.rigs.hq_scene import ANSWER
+from tests.e2e.rigs.moving_robot import MovingRobot
+from tests.e2e.rigs.processes import LINE_S, Part
+from tests.e2e.rigs.robots import SCALE
+from tests.e2e.rigs.steps import STEPS, Of, Order
+from tests.e2e.rigs.supervised import Supervised
 from tests.ports import free_port
 
 LIMIT_S = 1.5

@@ -1,7 +1,7 @@
 """HQ programs of every protocol and version at once at one robot, all of them fragile judges, and so is the robot.
 
-    python -m tests.e2e.hq_judge --seconds 60                # every robot: each drives, then one for a minute
-    python -m tests.e2e.hq_judge --robot alf --driver ec --seconds 10
+    python -m tests.e2e.measured.hq_judge --seconds 60                # every robot: each drives, then one for a minute
+    python -m tests.e2e.measured.hq_judge --robot alf --driver ec --seconds 10
 
 Each program has its listener. All must see what the robot has; one after the other drives, while the others idle
 beside it as deployed programs do, sending neutral; then one drives to and fro for as long as is said.
@@ -26,11 +26,11 @@ from gateways.alf.conformance.parser import Dialect
 from gateways.tcpudp.conformance.fragile_hq import FragileTcpUdpHq
 from gateways.tcpudp.conformance.parser import FeatureFlag
 from gateways.wc2ec.conformance.fragile_hq import FragileExternalController
-from tests.e2e import mixed
 from tests.e2e.conftest import HOST, Bench, Gateway, device, listener
-from tests.e2e.fragile import DISTURBED, Fragile, charges, disturbed, fragile_robot
-from tests.e2e.hq_scene import playing, ports, pushed, soon
-from tests.e2e.processes import report
+from tests.e2e.measured import mixed
+from tests.e2e.rigs.fragile import DISTURBED, Fragile, charges, disturbed, fragile_robot
+from tests.e2e.rigs.hq_scene import playing, ports, pushed, soon
+from tests.e2e.rigs.processes import report
 from tests.ports import free_port
 
 LEASE_S = 1.2

@@ -1,7 +1,7 @@
 """A ROS 2 robot that is in motion and whose driver, node or router is lost: how soon is it at rest?
 
-    python -m tests.e2e.ros_robot                          # every way 30 times
-    python -m tests.e2e.ros_robot --way stop --repetitions 5
+    python -m tests.e2e.measured.ros_robot                          # every way 30 times
+    python -m tests.e2e.measured.ros_robot --way stop --repetitions 5
 
 The robot is strict: it believes every command, holds it for ever, and complains about whatever is not as rmw_zenoh has
 it. Its router is apart from the bus.
@@ -25,7 +25,7 @@ import zenoh
 
 from gateways.ros2.conformance.strict_robot import HASHES, RELIABLE, StrictRobot, config, gid_of
 from tests.e2e.conftest import HOST, Bench, configuration, device, until
-from tests.e2e.processes import Finding, report
+from tests.e2e.rigs.processes import Finding, report
 from tests.ports import free_port
 
 LATE_S = 0.5

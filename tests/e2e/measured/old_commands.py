@@ -1,7 +1,7 @@
 """A driver's network is cut and heals: what it kept arrives at once, and moves no robot.
 
-    python -m tests.e2e.old_commands                    # 30 cuts of 1.0, 2.3 and 4.0 s; about ten minutes
-    python -m tests.e2e.old_commands --age 0            # the same with max_age_s = 0: how often the robot moved then
+    python -m tests.e2e.measured.old_commands            # 30 cuts of 1.0, 2.3 and 4.0 s; about ten minutes
+    python -m tests.e2e.measured.old_commands --age 0    # the same with max_age_s = 0: how often the robot moved then
 
 The driver (the Python client) is in a network namespace of its own. It pushes its stick, and during the cut says
 neutral and pushes again, as a person does who sees a picture that stands still; it says nothing more from half a second
@@ -21,8 +21,8 @@ from dataclasses import dataclass, field
 
 import zbridge
 from tests.e2e.conftest import until
-from tests.e2e.loss import Scene, query
-from tests.e2e.processes import Finding, go_apart, module, report
+from tests.e2e.rigs.loss import Scene, query
+from tests.e2e.rigs.processes import Finding, go_apart, module, report
 from zbridge.client.driver import Driver
 from zbridge.errors import Refused
 
@@ -58,7 +58,7 @@ class CutScene(Scene):
     def __init__(self, stack: contextlib.ExitStack, max_age_s: float) -> None:
         control = f"[control]\nlease_s = 60.0\nmax_age_s = {max_age_s}\n"
         super().__init__(stack, cut=True, parts=control, deadman_s=DEADMAN_S)
-        self.start_driver(*module("old_commands", "driver", self.reach))
+        self.start_driver(*module("tests.e2e.measured.old_commands", "driver", self.reach))
         assert self.driver.line() == "holds"
 
     def begins(self, since: float) -> bool:
@@ -146,7 +146,7 @@ def main() -> None:
     parser.add_argument("--age", type=float, default=0.4, help="max_age_s of the gateway")
     parser.add_argument("--seed", type=int, default=os.getpid(), help="of the moments")
     wanted = parser.parse_args()
-    if not go_apart("old_commands"):
+    if not go_apart("tests.e2e.measured.old_commands"):
         sys.exit(2)
     report(
         measure(seconds, repetitions=wanted.repetitions, max_age_s=wanted.age, seed=wanted.seed)

@@ -1,6 +1,6 @@
 """Programs that connect, shake hands and leave, thousands of times: what of them does the gateway keep?
 
-    python -m tests.e2e.hq_churn --cycles 10000
+    python -m tests.e2e.measured.hq_churn --cycles 10000
 
 They leave with a FIN or a RST, before the handshake, after it, or in the middle of driving. Afterwards the gateway's
 process has no more descriptors, threads or liveliness tokens than before, not much more memory, and room for all
@@ -19,8 +19,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from tests.e2e.conftest import Bench, device, listener
-from tests.e2e.hq_scene import NEUTRAL, ByHand, sessions, soon
-from tests.e2e.processes import Finding, report
+from tests.e2e.rigs.hq_scene import NEUTRAL, ByHand, sessions, soon
+from tests.e2e.rigs.processes import Finding, report
 from tests.ports import free_port
 
 CLIENTS = 254

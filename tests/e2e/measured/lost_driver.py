@@ -1,7 +1,7 @@
 """A robot whose driver is lost: how long after the last motion that it was told does the robot get its stop?
 
-    python -m tests.e2e.lost_driver                              # killed, frozen, cut 100 times; other ways 10 times
-    python -m tests.e2e.lost_driver --way cut --deadman 0.5 --repetitions 20
+    python -m tests.e2e.measured.lost_driver                       # killed, frozen, cut 100 times; other ways 10 times
+    python -m tests.e2e.measured.lost_driver --way cut --deadman 0.5 --repetitions 20
 
 The driver is a program on the bus that holds the lease, in a process of its own. Every command has a value of its own.
 A driver that is cut off is in a network namespace of its own, and every packet on the way is lost.
@@ -14,11 +14,11 @@ import itertools
 import random
 import signal
 
-from tests.e2e import loss
 from tests.e2e.conftest import until
-from tests.e2e.loss import EVERYWHERE, LATE_S, Result, Scene, Way, measured, query
-from tests.e2e.processes import report
-from tests.e2e.robots import SCALE
+from tests.e2e.rigs import loss
+from tests.e2e.rigs.loss import EVERYWHERE, LATE_S, Result, Scene, Way, measured, query
+from tests.e2e.rigs.processes import report
+from tests.e2e.rigs.robots import SCALE
 
 DEADMAN_S = 0.2
 FEW = 10
@@ -79,7 +79,7 @@ def main() -> None:
     times = {way: wanted.repetitions if WAYS[way].often else min(wanted.repetitions, FEW) for way in WAYS}
     report(
         measure(way, repetitions=times[way], deadman_s=wanted.deadman, seed=wanted.seed)
-        for way in loss.possible("lost_driver", wanted.way, WAYS)
+        for way in loss.possible("tests.e2e.measured.lost_driver", wanted.way, WAYS)
     )
 
 

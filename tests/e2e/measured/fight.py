@@ -1,7 +1,7 @@
 """Two drivers fight for one robot: does it ever obey both, and does the audit log tell all of it?
 
-    python -m tests.e2e.fight                 # a minute
-    python -m tests.e2e.fight --seconds 600 --seed 3
+    python -m tests.e2e.measured.fight                 # a minute
+    python -m tests.e2e.measured.fight --seconds 600 --seed 3
 
 Two processes acquire, take over, drive, go silent, stop and release as chance wills, and drive on for a while with
 leases they have lost. Each lease is asked for under a name of its own, and each command has a value of its own, so that
@@ -30,9 +30,9 @@ import msgpack
 import zenoh
 
 from tests.e2e.conftest import configuration
-from tests.e2e.loss import Scene, commander, query
-from tests.e2e.processes import Part, module
-from tests.e2e.robots import SCALE, STOP, Frame
+from tests.e2e.rigs.loss import Scene, commander, query
+from tests.e2e.rigs.processes import Part, module
+from tests.e2e.rigs.robots import SCALE, STOP, Frame
 from tests.proofs import Holder
 
 NAMES = ("anna", "bert")

@@ -1,7 +1,7 @@
 """A foreign judge of ``zbridge ros2``: dora-rs, in an environment of its own. Not of the suite.
 
     python3 -m venv DIR && DIR/bin/pip install dora-rs==1.1.0 pyarrow rosbags
-    python -m tests.e2e.dora_ros2 DIR/bin/python
+    python -m tests.e2e.measured.dora_ros2 DIR/bin/python
 
 A fragile robot of each protocol stands behind a gateway of its own. dora-rs receives what each protocol has of scan,
 odometry, frames and, as a late joiner, a map; its Twists move each robot and its calls stop them. What the robots say
@@ -21,9 +21,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-from tests.e2e.processes import ROOT
-from tests.e2e.ros2_scene import FRAGILE, GRID, FragileInFleet, RosScene
-from tests.e2e.stalls import LIMIT_S, TOLERANCE
+from tests.e2e.measured.stalls import LIMIT_S
+from tests.e2e.rigs.moving_robot import TOLERANCE
+from tests.e2e.rigs.processes import ROOT
+from tests.e2e.rigs.ros2_scene import FRAGILE, GRID, FragileInFleet, RosScene
 
 SPEEDS = {"tcpudp": 0.5, "alf": 0.5, "wc2ec": 0.65}
 """What each robot tells of 0.25 m/s, in a curve of 0.5 rad/s those that can: of wheels the speed of the faster one."""
@@ -48,7 +49,7 @@ class Run:
 def run(python: str, scene: RosScene) -> Run:
     """Let dora's node run."""
     heard = Run()
-    command = [python, "-m", "tests.e2e.dora_node", scene.ros_at, str(scene.folder / "types")]
+    command = [python, "-m", "tests.e2e.measured.dora_node", scene.ros_at, str(scene.folder / "types")]
     node = subprocess.Popen(command, text=True, stdout=subprocess.PIPE, cwd=ROOT)  # warnings go to our own stderr
     scene.stack.callback(node.kill)
     alarm = threading.Timer(PATIENCE_S, node.kill)

@@ -1,7 +1,7 @@
 """``zbridge ros2`` between two real routers: robots behind real gateways on one side, a node of ROS on the other.
 
 That node is the judge of :mod:`tests.views.ros2.judge`, which shares no code with the view. Robots are fragile
-ones of every protocol, each a process of its own that tells what it obeys (:mod:`tests.e2e.fragile`).
+ones of every protocol, each a process of its own that tells what it obeys (:mod:`tests.e2e.rigs.fragile`).
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from typing import Any
 import zenoh
 
 from tests.e2e.conftest import WAIT_S, Fleet, Gateway, configuration, device, end, repeated, start, until
-from tests.e2e.fragile import DISTURBED, ROBOTS, charges
-from tests.e2e.stalls import HELD_UP_S, TOLERANCE, MovingRobot
+from tests.e2e.rigs.fragile import DISTURBED, ROBOTS, charges
+from tests.e2e.rigs.moving_robot import HELD_UP_S, TOLERANCE, MovingRobot
 from tests.machine import Withheld
 from tests.ports import free_port
 from tests.views.ros2.judge import Heard, Publisher, Ros, Subscriber

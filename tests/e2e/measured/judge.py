@@ -1,7 +1,7 @@
 """Mixed commands through a real gateway against the fragile TCP/UDP robot: no violation, and everything arrives.
 
-    python -m tests.e2e.judge                     # every version, with and without UDP, 2000 commands each
-    python -m tests.e2e.judge --commands 300 --version 1.4 --udp
+    python -m tests.e2e.measured.judge                     # every version, with and without UDP, 2000 commands each
+    python -m tests.e2e.measured.judge --commands 300 --version 1.4 --udp
 
 A command that the robot's version or features exclude must be refused and never arrive. A "1.4" robot sends its map in
 parts all the time, which changes nothing.
@@ -15,10 +15,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from tests.e2e import mixed
-from tests.e2e.fragile import lost
-from tests.e2e.mixed import Arrival, Judgement, Put, Run
-from tests.e2e.processes import report
+from tests.e2e.measured import mixed
+from tests.e2e.measured.mixed import Arrival, Judgement, Put, Run
+from tests.e2e.rigs.fragile import lost
+from tests.e2e.rigs.processes import report
 
 VERSIONS = ("1.1", "1.2", "1.3", "1.4")
 GAP_S = 0.01

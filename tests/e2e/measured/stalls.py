@@ -1,10 +1,10 @@
 """A robot that stalls, or whose link is cut, while it is driven: how long after it goes on is it at rest?
 
-    python -m tests.e2e.stalls                                    # everything, 30 repetitions; about an hour and a half
-    python -m tests.e2e.stalls --repetitions 2 --robots tcpudp-1.3,alf --stalls 2.5 --cuts 2 --out stalls.jsonl
+    python -m tests.e2e.measured.stalls                      # everything, 30 repetitions; about an hour and a half
+    python -m tests.e2e.measured.stalls --repetitions 2 --robots tcpudp-1.3,alf --stalls 2.5 --cuts 2 --out stalls.jsonl
 
 Each sitting has a real gateway process, a fragile robot in a process of its own that tells its commanded motion
-(:mod:`tests.e2e.fragile`), and a driver on the bus in a process of its own. It is driven for a moment; then
+(:mod:`tests.e2e.rigs.fragile`), and a driver on the bus in a process of its own. It is driven for a moment; then
 
 stall: the robot's process is stopped (SIGSTOP) and goes on after some seconds (SIGCONT);
 cut: what is between the robot's network namespace and the gateway's forwards nothing for some seconds. Both keep
@@ -44,27 +44,23 @@ from typing import Any
 
 import zenoh
 
-from tests.e2e import loss
 from tests.e2e.conftest import Fleet, Gateway, configuration, device
-from tests.e2e.fragile import GOES_ON, ROBOTS
-from tests.e2e.processes import LINE_S, Part, Road, go_apart, module
-from tests.e2e.robots import SCALE
+from tests.e2e.rigs import loss
+from tests.e2e.rigs.fragile import ROBOTS
+from tests.e2e.rigs.moving_robot import REST_S, TOLERANCE, MovingRobot, waited
+from tests.e2e.rigs.processes import LINE_S, Part, Road, go_apart
+from tests.e2e.rigs.robots import SCALE
 from tests.ports import free_port
 
 LIMIT_S = 1.5
 """Most seconds from going on to rest."""
-REST_S = 1.5
-"""Seconds that a robot must stay at rest."""
 STALLS_S = (0.3, 0.7, 2.0, 2.5, 5.0, 20.0)
 CUTS_S = (1.0, 2.0, 4.0, 6.0, 8.0, 10.0)
 CAUSES = {"stall": ("neutral", "killed", "silent"), "cut": ("neutral", "killed", "silent", "driving")}
 """What the driver does meanwhile, in rotation; each robot begins with another one."""
 DEADMAN_S = 0.5
-HELD_UP_S = 3.0
-"""A driver that has moved nothing for so long begins again."""
 FIRST, AGAIN = 0.4, 0.8
 """Speed before, and speed of the driving that shows afterwards that the connection survived."""
-TOLERANCE = 0.02
 RATE_HZ = 25.0
 """Commands of the driver in a second."""
 PATIENCE_S = 4.0
@@ -128,73 +124,6 @@ class Outcome:
     def good(self) -> bool:
         """Whether everything was as it should be."""
         return self.verdict == "at rest" and not self.faults
-
-
-class MovingRobot:
-    """A fragile robot's process, and what it tells of its motion."""
-
-    def __init__(
-        self, stack: contextlib.ExitStack, name: str, host: str, enter: Sequence[str], seed: int, **options: Any
-    ) -> None:
-        self.changes: list[tuple[float, float]] = [(0.0, 0.0)]
-        """When it told a speed, and which."""
-        self.report: dict[str, Any] = {}
-        self.went_on = 0.0
-        """When its program last went on after its own send held it up."""
-        self._ports: queue.Queue[int] = queue.Queue()
-        told = json.dumps({"seed": seed, "tells": True, **options})
-        self.part = Part(stack, *enter, *module("fragile", name, host, told), heard=self._hear)
-        self.port = self._ports.get(timeout=LINE_S)
-
-    def _hear(self, line: str) -> None:
-        at, _, what = line.partition(" ")
-        if line.startswith("{"):
-            self.report = json.loads(line)
-        elif what == GOES_ON:
-            self.went_on = float(at)
-        elif what:
-            self.changes.append((float(at), float(what)))
-        else:
-            self._ports.put(int(line))
-
-    @property
-    def speed(self) -> float:
-        """The speed of the last command that it obeyed."""
-        return self.changes[-1][1]
-
-    def moving(self, speed: float, timeout_s: float) -> bool:
-        """Wait until it moves at a speed; tell whether it does."""
-        return _waited(lambda: abs(self.speed - speed) <= TOLERANCE, timeout_s)
-
-    def begins(self, speed: float, driver: Part) -> bool:
-        """Wait until a driver has set it in motion. One that was held up met its deadman, and owes a neutral."""
-        deadline = time.monotonic() + LINE_S
-        while not self.moving(speed, HELD_UP_S):
-            if time.monotonic() > deadline:
-                return False
-            driver.say(f"again {round(speed * SCALE)}")
-        return True
-
-    def rest(self, since: float, patience_s: float) -> float | None:
-        """Wait until it has been at rest for REST_S; give when it came to rest, None if it did not in time."""
-        deadline = time.monotonic() + patience_s
-        while time.monotonic() < deadline + REST_S:
-            came = max(since, self.changes[-1][0])
-            if self.speed and time.monotonic() > deadline:
-                return None
-            if not self.speed and time.monotonic() - came >= REST_S:
-                return came
-            time.sleep(0.02)
-        return None
-
-
-def _waited(condition: Callable[[], bool], timeout_s: float) -> bool:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.02)
-    return True
 
 
 def _sleep_until(at: float) -> None:
@@ -270,7 +199,7 @@ class Sitting:
         file = self._scene.folder / f"{self._name}.toml"
         self._gateway = Gateway(self._stack, file, self._scene.endpoint, *parts, robot=self._name)
         gone = self._gateway.process.poll
-        if not _waited(lambda: self._status.get("state") == "established" or gone() is not None, LINE_S):
+        if not waited(lambda: self._status.get("state") == "established" or gone() is not None, LINE_S):
             raise RuntimeError(f"not established within {LINE_S:g} s; {self._status}")
         if gone() is not None:
             raise RuntimeError(f"the gateway ended with {gone()}")
@@ -290,7 +219,7 @@ class Sitting:
     def _hear_again(self) -> None:
         """Wait until the robot's own bytes come through again: a second cut would double the wait of its kernel."""
         before = self._count(PUBLISHED)
-        if not _waited(lambda: self._count(PUBLISHED) > before, self._patience_s):
+        if not waited(lambda: self._count(PUBLISHED) > before, self._patience_s):
             self.outcome.faults.append("nothing came from the robot any more")
 
     # What is measured
@@ -388,7 +317,7 @@ class Sitting:
         """End the robot, and take what its judge noted: it must have had one connection all the time."""
         self._robot.part.signal(signal.SIGCONT)
         self._robot.part.say("end")
-        _waited(lambda: bool(self._robot.report), 5)
+        waited(lambda: bool(self._robot.report), 5)
         report = self._robot.report
         self.outcome.judge = {key: value[-5:] if isinstance(value, list) else value for key, value in report.items()}
         if not report.get("alive", True):
@@ -503,7 +432,7 @@ def _cases(wanted: argparse.Namespace) -> list[Case]:
 
 def main() -> None:
     wanted = _parsed()
-    if wanted.cuts and not go_apart("stalls"):
+    if wanted.cuts and not go_apart("tests.e2e.measured.stalls"):
         wanted.cuts = ()
     os.nice(5)
     cases = _cases(wanted)

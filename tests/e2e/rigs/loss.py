@@ -25,8 +25,8 @@ import msgpack
 import zenoh
 
 from tests.e2e.conftest import HOST, Gateway, Lease, configuration, device, end, until
-from tests.e2e.processes import LINE_S, Finding, Part, Road, frozen, go_apart, module
-from tests.e2e.robots import SCALE, STOP, Frame, Robot
+from tests.e2e.rigs.processes import LINE_S, Finding, Part, Road, frozen, go_apart, module
+from tests.e2e.rigs.robots import SCALE, STOP, Frame, Robot
 from tests.machine import Withheld, contended_s
 from tests.ports import free_port
 from tests.proofs import packed
@@ -76,14 +76,14 @@ def be_router(endpoint: str) -> None:
 
 def router(stack: contextlib.ExitStack, endpoint: str) -> Part:
     """Start a router in a process of its own."""
-    part = Part(stack, *module("loss", "router", endpoint))
+    part = Part(stack, *module("tests.e2e.rigs.loss", "router", endpoint))
     assert part.line() == "open"
     return part
 
 
 def driver(endpoint: str, robot: str, deadman_s: float, rate_hz: float, first: int, step: int = 1) -> list[str]:
     """Give the command of a driver; its motions are first, first + step, ... of SCALE."""
-    return module("loss", "driver", endpoint, robot, deadman_s, rate_hz, first, step)
+    return module("tests.e2e.rigs.loss", "driver", endpoint, robot, deadman_s, rate_hz, first, step)
 
 
 def be_driver(endpoint: str, robot: str, deadman_s: str, rate_hz: str, first: str, step: str) -> None:

@@ -1,7 +1,7 @@
 """A robot that an old HQ program drives through a listener, and the program or the listener is lost: when does it stop?
 
-    python -m tests.e2e.lost_hq --repetitions 50                 # programs of each protocol, every way
-    python -m tests.e2e.lost_hq --program alf --way cut
+    python -m tests.e2e.measured.lost_hq --repetitions 50                 # programs of each protocol, every way
+    python -m tests.e2e.measured.lost_hq --program alf --way cut
 
 A real gateway process, a router, a listener in a process of its own (`process-frozen`: in the gateway's), and a driving
 HQ program in one more. Every motion has a value of its own. A program that is cut off is in a network namespace of its
@@ -20,10 +20,10 @@ import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
-from tests.e2e import loss
 from tests.e2e.conftest import HOST, until
-from tests.e2e.loss import EVERYWHERE, LATE_S, Result, Scene, Way, measured, query
-from tests.e2e.processes import module, report
+from tests.e2e.rigs import loss
+from tests.e2e.rigs.loss import EVERYWHERE, LATE_S, Result, Scene, Way, measured, query
+from tests.e2e.rigs.processes import module, report
 from tests.ports import free_port
 
 KEPT_S = 1.6
@@ -36,7 +36,7 @@ PUSHES = 5
 
 @dataclass(frozen=True)
 class Driven:
-    """How a robot is driven. program: of ``tests.e2e.hq_programs``. deadman_s: what the protocol page gives it."""
+    """How a robot is driven. program: of ``tests.e2e.rigs.hq_programs``. deadman_s: what the protocol page gives it."""
 
     protocol: str
     deadman_s: float
@@ -74,7 +74,7 @@ class HqScene(Scene):
 
     def drive(self, rng: random.Random) -> int:
         until(lambda: query(self.session, "control").get("state") in ("free", "stopped"), what="the robot is free")
-        self.start_driver(*module("hq_programs", self._program, self.here, self._port))
+        self.start_driver(*module("tests.e2e.rigs.hq_programs", self._program, self.here, self._port))
         assert self.driver.line() == "ready"
         for _ in range(PUSHES):  # a listener that has only just started may not know the robot yet
             first = self.push(0.5)
@@ -143,7 +143,7 @@ def main() -> None:
     parser = loss.options(__doc__, WAYS, repetitions=10)
     parser.add_argument("--program", choices=(*DRIVEN, "all"), default="all")
     wanted = parser.parse_args()
-    ways = loss.possible("lost_hq", wanted.way, WAYS)
+    ways = loss.possible("tests.e2e.measured.lost_hq", wanted.way, WAYS)
     report(
         result
         for program in DRIVEN

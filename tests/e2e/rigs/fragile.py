@@ -1,9 +1,9 @@
 """Fragile robots, each a process of its own, so that nothing but the machine makes it late.
 
-``python -m tests.e2e.fragile NAME HOST [OPTIONS]``: prints its port. The line ``cut`` on stdin breaks its connection;
-any other ends it, and it prints what it received and what was violated as one JSON object, bytes as hex. NAME is one of
-:data:`ROBOTS`. OPTIONS: more arguments of the robot's class, ``times``, ``port`` (default any), and ``tells``, as a
-JSON object.
+``python -m tests.e2e.rigs.fragile NAME HOST [OPTIONS]``: prints its port. The line ``cut`` on stdin breaks its
+connection; any other ends it, and it prints what it received and what was violated as one JSON object, bytes as hex.
+NAME is one of :data:`ROBOTS`. OPTIONS: more arguments of the robot's class, ``times``, ``port`` (default any), and
+``tells``, as a JSON object.
 
 A robot that ``tells`` prints a line ``AT SPEED`` (monotonic seconds, fraction of full scale) for each change of what it
 last obeyed, and waits for its own sends as long as its kernel does: deployed ones block in them.
@@ -27,7 +27,7 @@ from gateways.tcpudp.conformance.fragile_robot import FragileRobot
 from gateways.tcpudp.conformance.machine import Quirks
 from gateways.wc2ec.conformance import parser as wc2ec_wire
 from gateways.wc2ec.conformance.fragile_robot import FragileWebotsController
-from tests.e2e.processes import Part, module
+from tests.e2e.rigs.processes import Part, module
 
 SEND_S = 3600.0
 HELD_UP_S = 0.1
@@ -222,7 +222,9 @@ class Fragile(Part):
     """A fragile robot that was started here."""
 
     def __init__(self, stack: contextlib.ExitStack, name: str, *, seed: int = 1, **options: Any) -> None:
-        super().__init__(stack, *module("fragile", name, "127.0.0.1", json.dumps({"seed": seed, **options})))
+        super().__init__(
+            stack, *module("tests.e2e.rigs.fragile", name, "127.0.0.1", json.dumps({"seed": seed, **options}))
+        )
         self.kind = ROBOTS[name]
         self.port = int(self.line())
         self._report: dict[str, Any] | None = None

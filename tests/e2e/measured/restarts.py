@@ -1,7 +1,7 @@
 """Restarts under traffic, with motion before each: one connection, no packet lost or doubled, how long nothing came.
 
-    python -m tests.e2e.restarts                  # 100 restarts for each protocol
-    python -m tests.e2e.restarts --times 5 --protocol alf
+    python -m tests.e2e.measured.restarts                  # 100 restarts for each protocol
+    python -m tests.e2e.measured.restarts --times 5 --protocol alf
 
 The robots number what they send, and cut it where frames do not end; a restart finds most of them within a frame. The
 numbers that came on the bus are held against those that were sent.
@@ -29,9 +29,9 @@ from typing import Any, ClassVar
 from gateways.alf.conformance import parser as alf
 from gateways.wc2ec.conformance import parser as wc2ec
 from tests.e2e.conftest import HOST, Bench, Gateway, device, until
-from tests.e2e.fragile import WHEELS
-from tests.e2e.processes import Finding, report
-from tests.e2e.robots import MOVE, ROTATE, SETTINGS, STOP, position
+from tests.e2e.rigs.fragile import WHEELS
+from tests.e2e.rigs.processes import Finding, report
+from tests.e2e.rigs.robots import MOVE, ROTATE, SETTINGS, STOP, position
 
 CUT_S = 0.002
 """Seconds between the two parts of a message."""

@@ -1,6 +1,6 @@
 """Recorders that are killed at any moment: every file is readable to its cut, and lacks a second at most.
 
-python -m tests.e2e.killed_recorders --times 100
+python -m tests.e2e.measured.killed_recorders --times 100
 """
 
 from __future__ import annotations

@@ -1,0 +1,98 @@
+"""Broken variants that engineers chose who had read neither the rules nor the situations."""
+
+from __future__ import annotations
+
+from tests.simulated.mutants_data import AUTHORITY, COMMANDS, ENFORCER, LATCH, PRESENCE, STANDSTILL, Mutant
+
+
+def _mutant(name: str, file: str, old: str, new: str) -> Mutant:
+    return Mutant(name, "situations", file, old, new)
+
+
+FOUND = (
+    _mutant(
+        "ages are counted from the first command",
+        AUTHORITY,
+        "        age.late_s(request.t, cause.received_ms)\n",
+        "",
+    ),
+    _mutant(
+        "a suspension ends no lease of a robot that does not move",
+        ENFORCER,
+        '            self.stop(f"the gateway\'s machine was suspended for {asleep_s:.1f} s")\n',
+        "            if self.authority.moving:\n                self.stop(f'suspended for {asleep_s:.1f} s')\n",
+    ),
+    _mutant(
+        "a takeover does not wait for the fleet's latched stops",
+        "zbridge/control/lease_server.py",
+        "        self._require_latches()\n        request = _request(query)\n",
+        "        request = _request(query)\n",
+    ),
+    _mutant(
+        "a latch that another gateway knows to be released is adopted",
+        LATCH,
+        "for latch in answer.latches if latch.id not in released}",
+        "for latch in answer.latches if latch.id not in answer.released}",
+    ),
+    _mutant(
+        "the loss of a robot that does not move holds nobody back",
+        PRESENCE,
+        "            if not self._leaving:\n",
+        "            if not self._leaving and self._enforcer.authority.moving:\n",
+    ),
+    _mutant(
+        "neutral does not call off a mode 3 that waits for the disk",
+        COMMANDS,
+        "            self._enforcer.require_fresh(sender)\n        else:\n            self._awaiting = None\n",
+        "            self._enforcer.require_fresh(sender)\n",
+    ),
+    _mutant(
+        "motion while the robot is away asks for no neutral",
+        "zbridge/hq/operator.py",
+        "            self.intent.refused(missing)\n",
+        "",
+    ),
+    _mutant(
+        "a restart that failed ends the look for other gateways",
+        "zbridge/app/handover/restarts.py",
+        "        self._ownership.hands_over = self._withdrawn = False\n",
+        "        self._withdrawn = False\n",
+    ),
+    _mutant(
+        "a gateway that is gone is shown for ever",
+        "zbridge/app/serving.py",
+        "        self._conditions.set(_RIVALS, text if claims else None)\n",
+        "        if claims:\n            self._conditions.set(_RIVALS, text)\n",
+    ),
+    _mutant(
+        "a stop is one of the wheels only",
+        "gateways/wc2ec/translate.py",
+        "            for device in self._table.motors(ROTATIONAL):\n                self._set_motor(device, 0.0,",
+        "            for device in filter(None, map(self._table.named, self._velocities(Drive()))):\n"
+        "                self._set_motor(device, 0.0,",
+    ),
+    _mutant(
+        "a reconnected robot is stopped as if it had never been told mode 3",
+        "gateways/tcpudp/session/hq_role.py",
+        "predecessor is not None and predecessor.sent_autonomous",
+        "False",
+    ),
+    _mutant(
+        "a robot that sleeps after packet 4 is written to",
+        "gateways/tcpudp/session/hq_handshake.py",
+        "        self.outbox.quiet(self._silent_until)\n",
+        "",
+    ),
+    _mutant(
+        "a stop counts as confirmed where the robot is stopped already",
+        "zbridge/client/stops.py",
+        "lambda control: stop.id in control.stops, CONFIRM_S",
+        'lambda control: control.state in ("stopped", "latched"), CONFIRM_S',
+    ),
+    _mutant(
+        "a latched robot is sent no more stops than others",
+        STANDSTILL,
+        "(self._idle_stop_s or self._authority.latches)",
+        "self._idle_stop_s",
+    ),
+)

@@ -1,0 +1,102 @@
+"""Rules about stops: those that are reported, those that are repeated, and those that have to wait.
+
+Source: "The latched stop" in ``docs/control.md``, "When the robot's program or its link stalls" and the silence after
+packet 4 in ``docs/what-happens.md``.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from typing import TYPE_CHECKING, Any
+
+from tests.simulated.accounts import read
+from tests.simulated.written import stops
+
+if TYPE_CHECKING:
+    from tests.simulated.checker import Checker
+
+IDLE_STOP_S = 1.0
+"""Seconds between two stops to a robot that nobody drives."""
+LATE_S = 1.2
+"""How much later a stop may be: stops that follow a neutral, and those that a link or a full buffer holds up."""
+ASKED_S = 5.0
+"""Longest time that a program takes to confirm a stop."""
+SILENCE_S = 2.5
+"""Seconds after packet 4 in which a TCP/UDP robot gets nothing but a packet 7."""
+ON_ITS_WAY_S = 0.15
+"""Seconds for which what was written before the gateway had the packet 4 is excused."""
+
+
+class StopRules:
+    """Follows the stops on the bus, and those that a gateway writes to the robot."""
+
+    def __init__(self, checker: Checker) -> None:
+        self._checker = checker
+        self._world = checker.world
+        self._put: defaultdict[str, dict[bytes, float]] = defaultdict(dict)
+        """By program, the ids of the stops that it sent this robot, and when first."""
+        self._received: set[bytes] = set()
+        self._stopped_at: dict[str, float] = {}
+        """By gateway, when it wrote a stop last."""
+        self._works: tuple[str | None, float] = (None, 0.0)
+        self._starts: dict[str, float] = {}
+        """By gateway, when the robot asked it for datagrams."""
+
+    def watch(self, who: str, what: str, fields: tuple[Any, ...]) -> None:
+        """Follow the trace."""
+        if what in ("puts", "receives") and fields[0].endswith("@cmd/stop"):
+            stop_id = read(fields[1]).get("id")
+            if isinstance(stop_id, bytes) and what == "puts":
+                self._put[who].setdefault(stop_id, self._world.now)
+            elif isinstance(stop_id, bytes) and who.rstrip("+-") in self._checker.gateways:
+                self._received.add(stop_id)
+        elif what == "done" and fields[0] in ("stop", "latch"):
+            self._on_done(who, fields[0])
+        elif (who, what) == ("robot", "connected"):
+            self._starts.pop(self._checker.by_host.get(fields[0][0], ""), None)
+        elif (who, what) == ("robot", "starts datagrams"):
+            self._starts[self._checker.by_host.get(fields[0][0], "")] = self._world.now
+        elif what == "writes" and fields[0][0] == "robot" and who in self._starts:
+            self._look_at_silence(who, bytes.fromhex(fields[1]))
+
+    def _on_done(self, who: str, what: str) -> None:
+        """What a program is told to be done, was done: a gateway of the robot received the stop."""
+        sent = {stop_id for stop_id, at in self._put[who].items() if self._world.now - at < ASKED_S}
+        self._checker.counts[f"{what} confirmed"] += 1
+        if sent and not sent & self._received:
+            self._checker.violate("confirmed", f"{who} was told that its {what} was done, which no gateway received")
+
+    def _look_at_silence(self, gateway: str, data: bytes) -> None:
+        begun, now = self._starts[gateway], self._world.now
+        silent = begun + ON_ITS_WAY_S < now < begun + SILENCE_S - ON_ITS_WAY_S
+        if silent and len(data) >= 6 and data[5] != 7 and self._checker.obligations.calm_since(begun - 1.0):
+            self._checker.violate("silence", f"{gateway} wrote packet {data[5]}, {now - begun:.2f} s after packet 4")
+
+    def written(self, gateway: str, data: bytes) -> None:
+        """Take what a gateway wrote."""
+        if stops(self._checker.protocol, data):
+            self._stopped_at[gateway] = self._world.now
+
+    def tick(self) -> None:
+        """Look for a robot that nobody drives, and that is sent no stop."""
+        now, checker = self._world.now, self._checker
+        gateway = checker.obligations.works()
+        if gateway != self._works[0]:
+            self._works = (gateway, now)
+        if gateway is None or not self._owes_stops(gateway):
+            return
+        grant = checker.current.get(gateway)
+        ended_at = grant.ended_at or 0.0 if grant is not None else 0.0
+        idle_since = max([ended_at, *checker.latches[gateway].values()])
+        since = max(self._stopped_at.get(gateway, 0.0), self._works[1], idle_since)
+        if now - since > IDLE_STOP_S + LATE_S and checker.obligations.calm_since(since - 1.0):
+            latched = "a latched robot" if checker.latches[gateway] else "a robot that nobody drives"
+            checker.violate("idle-stop", f"{gateway} sent {latched} no stop for {now - since:.1f} s")
+            self._stopped_at[gateway] = now
+
+    def _owes_stops(self, gateway: str) -> bool:
+        """Whether the robot must be sent stops now: it is latched, or nobody has its lease."""
+        if self._checker.latches[gateway]:
+            return True
+        grant, control = self._checker.current.get(gateway), self._checker.simulation.scenario.get("control", {})
+        return (grant is None or grant.ended_at is not None) and control.get("idle_stop_s") != 0

@@ -147,12 +147,14 @@ class RobotCommands(ViewerCommands):
     def _stop_soon(self, viewer: Subscriber, robot: str) -> None:
         """Stop a robot on a task. One runs for each robot; a stop that comes meanwhile makes it stop once more."""
         self._stopped([robot])
-        self._stop_again.add(robot)
-        if robot not in self._stops:
+        if robot in self._stops:
+            self._stop_again.add(robot)
+        else:
             self._stops[robot] = asyncio.get_running_loop().create_task(self._stop_and_tell(viewer, robot))
 
     async def _stop_and_tell(self, viewer: Subscriber, robot: str) -> None:
         try:
+            await self._stop([robot])
             while robot in self._stop_again:
                 self._stop_again.discard(robot)
                 await self._stop([robot])

@@ -129,6 +129,15 @@ def test_simulators_and_conformance_kits_are_imported_when_they_are_called(packa
     assert [name for name in imported if set(name.split(".")) & set(lazy)] == []
 
 
+def test_the_judge_of_ros_2_shares_no_code_with_the_gateway() -> None:
+    """No command reaches it, so it is no part of the product, and of no contract."""
+    judge = ast.parse((ROOT / "tests/gateways/ros2/strict_robot.py").read_text())
+    ours = ("gateways", "tests", "zbridge")
+    froms = [node.module or "" for node in ast.walk(judge) if isinstance(node, ast.ImportFrom)]
+    names = [alias.name for node in ast.walk(judge) if isinstance(node, ast.Import) for alias in node.names]
+    assert [name for name in froms + names if name.startswith(ours)] == ["zbridge.simulation.judge"]
+
+
 @pytest.mark.parametrize("protocol", ["tcpudp", "wc2ec"])
 def test_a_gateway_loads_numpy_only_when_an_array_comes(protocol: str) -> None:
     loads = f"import gateways.{protocol}, zbridge.app, zbridge.bus.zenoh, zbridge.robot.device, sys"

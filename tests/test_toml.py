@@ -10,7 +10,7 @@ import pytest
 
 from zbridge.app.config import load
 from zbridge.errors import ConfigError
-from zbridge.toml import FILE_BYTES, parse_toml, read_file, read_toml
+from zbridge.toml import FILE_BYTES, as_toml, parse_toml, read_file, read_toml
 
 
 def fault(path: Path, most_bytes: int = FILE_BYTES) -> str:
@@ -90,3 +90,12 @@ def test_the_content_that_was_read_counts_whatever_the_file_holds_now(tmp_path: 
     path.write_text("nonsense")
     connect = b'[device]\nprotocol = "tcpudp"\nconnect = ["tcp://127.0.0.1:1"]\n'
     assert load(path, content=b'[robot]\nname = "r1"\n' + connect).config.robot.name == "r1"
+
+
+def test_what_is_written_as_toml_is_read_as_it_was() -> None:
+    value = {
+        "names": ["r1", 'a "b"\\', "Gr\u00fc\u00dfe \U0001f916"],
+        "at": {"x y": 0.5, "on": True, "many": [[1, 2], []]},
+    }
+    assert parse_toml(Path("a.toml"), f"value = {as_toml(value)}\n".encode()) == {"value": value}
+    assert as_toml(("tls/a:1", "tls/b:2")) == '["tls/a:1", "tls/b:2"]'

@@ -70,6 +70,15 @@ def parse_toml(path: Path, content: bytes) -> dict[str, Any]:
         raise ConfigError(f"{path}: not TOML: nested too deeply") from error
 
 
+def as_toml(value: object) -> str:
+    """Write a value as TOML, on one line: JSON's forms of strings and numbers are TOML's, those of tables are not."""
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(as_toml, value))}]"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{as_toml(name)} = {as_toml(item)}" for name, item in value.items()) + "}"
+    return msgspec.json.encode(value).decode()
+
+
 def read_struct(path: Path, kind: type[T]) -> T:
     """Make a struct of a TOML file; raise ConfigError, which names file, key, value and what was expected."""
     raw = read_toml(path)

@@ -22,8 +22,8 @@ class RecordingRobot(FragileRobot):
 
     def __init__(self, account: Path) -> None:
         self._account, self._known = account.open("w", buffering=1), 0.0
-        violated = partial(self.record, "violation:")
-        super().__init__(version="1.3", udp=False, seed=1, quirks=Quirks(client_id=2), note=violated)
+        super().__init__(version="1.3", udp=False, seed=1, quirks=Quirks(client_id=2))
+        self.note = partial(self.record, "violation:")
         steer = self.machine.steer
 
         def obey(body: bytes) -> None:

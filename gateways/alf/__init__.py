@@ -61,7 +61,7 @@ async def _simulate(simulation: Simulation) -> None:
 
         links = len(simulation.addresses)
         first, *others = fragile_vehicle(dialect.value, servers=links, seed=simulation.seed)
-        await first.simulate(simulation, *others)
+        await first.simulate(simulation.addresses, simulation.ready, *others)
     else:
         from gateways.alf.simulator import simulate
 

@@ -63,7 +63,6 @@ class Car:
         return f"<Car {self.body} at {self.speed_m_s:.2f} m/s>"
 
     def take(self, command: DriveCommand) -> None:
-        """Obey a drive command."""
         straight = _FULL_LOCK_DEG if self._dialect is AlfDialect.BINARY else 0
         right_deg = max(-_FULL_LOCK_DEG, min(_FULL_LOCK_DEG, command.steering - straight))
         most = _MOST_SPEED if self._dialect is AlfDialect.BINARY else _MOST_TEXT_SPEED
@@ -114,9 +113,6 @@ class VehicleSimulator(Simulator[AlfMessage]):
         self.car = Car(seed, dialect)
         self._dialect = dialect
         self._drive, self._laser = (DRIVE, LASER) if links > 1 else (VEHICLE, VEHICLE)
-
-    def __repr__(self) -> str:
-        return f"<VehicleSimulator {self.car}>"
 
     def session(self, peer: str, link: str) -> VehicleRole:
         session = VehicleRole(self._dialect)

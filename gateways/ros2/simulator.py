@@ -12,6 +12,7 @@ import math
 import random
 import socket
 import time
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -47,8 +48,7 @@ from zbridge.ros2 import (
     read_attachment,
     types_of,
 )
-from zbridge.simulation.simulator import CATCH_UP_S, STEP_S
-from zbridge.simulation.timing import Ticker
+from zbridge.simulation.simulator import STEP_S, live
 from zbridge.simulation.world import Body, Grid, cast
 from zbridge.transport import Conversation
 from zbridge.transport.samples import serve
@@ -124,7 +124,6 @@ class NodeRole(Session[Any]):
             self.send_first(KeyedSample(SampleKind.ANNOUNCE, token))
 
     def publish(self, name: str, message: Any) -> None:
-        """Put a message on one of the robot's topics."""
         publisher = self._publishers.get(name)
         if publisher is None:
             raise ProtocolError(f"{name}: not announced yet")
@@ -148,7 +147,6 @@ class RosMachine:
         return f"<RosMachine {self.body} {self.forward:+.2f} m/s {self.turn:+.2f} rad/s>"
 
     def take(self, twist: Any) -> None:
-        """Obey one command."""
         forward, turn = float(twist.linear.x), float(twist.angular.z)
         if math.isfinite(forward) and math.isfinite(turn):
             self.forward = max(-FASTEST_M_S, min(FASTEST_M_S, forward))
@@ -156,7 +154,6 @@ class RosMachine:
             self._commanded_s = self._lived_s
 
     def step(self, dt: float) -> None:
-        """Advance by ``dt`` seconds."""
         self._lived_s += dt
         if self._lived_s - self._commanded_s > TIMEOUT_S:
             self.forward = self.turn = 0.0
@@ -181,7 +178,6 @@ class RosMachine:
         )
 
     def odometry(self, header: Any) -> Any:
-        """Say where it is and how it moves."""
         make, body = self._types.message, self.body
         pose = make(
             "geometry_msgs/msg/Pose",
@@ -202,7 +198,6 @@ class RosMachine:
         )
 
     def imu(self, header: Any) -> Any:
-        """Measure its turning and gravity."""
         make = self._types.message
         return make(
             "sensor_msgs/msg/Imu",
@@ -213,7 +208,6 @@ class RosMachine:
         )
 
     def battery(self, header: Any) -> Any:
-        """Say how full the battery is."""
         level = max(0.0, 1.0 - self._lived_s / EMPTY_S)
         voltage = EMPTY_V + level * (FULL_V - EMPTY_V)
         return self._types.message(
@@ -271,7 +265,7 @@ async def simulate(simulation: Simulation) -> None:
     async with serve(address, conversation):
         simulation.ready((address,))
         try:
-            await _live(machine, session, conversation, types)
+            await live(partial(_step, machine, session, conversation, types))
         finally:
             conversation.close("simulator ended")
 
@@ -284,21 +278,17 @@ def _with_port(address: Address) -> Address:
         return Address(address.host, int(free.getsockname()[1]))
 
 
-async def _live(machine: RosMachine, session: NodeRole, conversation: Conversation, types: Types) -> None:
-    ticker, steps = Ticker(STEP_S, catch_up_s=CATCH_UP_S), 0
-    while True:
-        await ticker.tick()
-        steps += 1
-        machine.step(STEP_S)
-        if session.state is not State.ESTABLISHED:
-            continue
-        seconds, nanoseconds = divmod(time.time_ns(), _NS_PER_S)
-        stamp = types.message("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
-        for name, (measure, frame, every) in _SENT.items():
-            if steps % every == 0:
-                header = types.message("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
-                session.publish(name, measure(machine, header))
-        conversation.pump()
+def _step(machine: RosMachine, session: NodeRole, conversation: Conversation, types: Types, steps: int) -> None:
+    machine.step(STEP_S)
+    if session.state is not State.ESTABLISHED:
+        return
+    seconds, nanoseconds = divmod(time.time_ns(), _NS_PER_S)
+    stamp = types.message("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
+    for name, (measure, frame, every) in _SENT.items():
+        if steps % every == 0:
+            header = types.message("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+            session.publish(name, measure(machine, header))
+    conversation.pump()
 
 
 _DIALECTS = {"twist": TWIST, "stamped": TWIST_STAMPED}

@@ -68,7 +68,7 @@ async def _simulate(simulation: Simulation) -> None:
         from gateways.tcpudp.conformance.fragile_robot import FragileRobot
 
         robot = FragileRobot(version=simulation.version or "1.3", udp=simulation.udp, seed=simulation.seed)
-        await robot.simulate(simulation)
+        await robot.simulate(simulation.addresses, simulation.ready)
     else:
         from gateways.tcpudp.simulator import simulate
 

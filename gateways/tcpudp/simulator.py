@@ -72,11 +72,9 @@ class Vehicle:
 
     @property
     def moving(self) -> bool:
-        """True while it moves as commanded."""
         return any(self._motion)
 
     def step(self, dt: float) -> None:
-        """Live for ``dt`` seconds."""
         self._idle_s += dt
         if self._idle_s > SILENCE_S:
             self._motion = (0.0, 0.0, 0.0)
@@ -153,9 +151,6 @@ class RobotSimulator(Simulator[packets.Packet]):
         self._parts = version == "1.4"
         self._ids = ClientIds(CLIENTS, QUIET_S)
 
-    def __repr__(self) -> str:
-        return f"<RobotSimulator {self.vehicle}>"
-
     def session(self, peer: str, link: str) -> RobotRole | None:
         client_id = self._ids.take(self._loop.time())
         if client_id is None:
@@ -165,7 +160,6 @@ class RobotSimulator(Simulator[packets.Packet]):
         return session
 
     def dismiss(self, client: Conversation) -> None:
-        """Take the client's id back."""
         assert isinstance(client.session, RobotRole)
         self._ids.release(client.session.client_id, self._loop.time())
 

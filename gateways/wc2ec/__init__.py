@@ -89,7 +89,8 @@ async def _simulate(simulation: Simulation) -> None:
     if simulation.fragile:
         from gateways.wc2ec.conformance.fragile_robot import FragileWebotsController
 
-        await FragileWebotsController(dialect.value, seed=simulation.seed).simulate(simulation)
+        controller = FragileWebotsController(dialect.value, seed=simulation.seed)
+        await controller.simulate(simulation.addresses, simulation.ready)
     else:
         from gateways.wc2ec.simulator import simulate
 

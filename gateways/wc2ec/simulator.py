@@ -70,7 +70,6 @@ class WebotsMachine:
         return f"<WebotsMachine {self.body} wheels {self.velocities}>"
 
     def take(self, message: Wc2EcMessage) -> None:
-        """Obey one command of an external controller."""
         match message:
             case SetValue(number=number, value=value) if number in self.velocities and math.isfinite(value):
                 self.velocities[number] = max(-FASTEST_RAD_S, min(FASTEST_RAD_S, value))
@@ -86,7 +85,6 @@ class WebotsMachine:
                 self.settings[number] = values.tolist()
 
     def step(self, dt: float) -> None:
-        """Advance by ``dt`` seconds."""
         left, right = self.velocities[_LEFT] * WHEEL_RADIUS_M, self.velocities[_RIGHT] * WHEEL_RADIUS_M
         self.body.step((left + right) / 2, 0.0, (right - left) / TRACK_M, dt)
         way = self._lift_to_m - self.lift_m
@@ -116,9 +114,6 @@ class ControllerSimulator(Simulator[Wc2EcMessage]):
         super().__init__(log)
         self.machine = WebotsMachine(seed)
         self._dialect = dialect
-
-    def __repr__(self) -> str:
-        return f"<ControllerSimulator {self.machine}>"
 
     def session(self, peer: str, link: str) -> ControllerRole:
         session = ControllerRole(self._dialect, values=VALUES)

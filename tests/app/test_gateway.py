@@ -115,11 +115,10 @@ async def test_the_successor_of_a_gateway_that_died_binds_listeners_of_its_own()
     near, far = socket.socketpair()
     with near, far:
         gateway = Gateway(plan({"robot": {"name": "r1"}, "device": NOWHERE, "hq": [listener]}), predecessor=far)
-        assert gateway._incoming is not None
         gateway._incoming.state = HandoverState(VERSION, {}, 0, claim={"since": 1.0}, device={"links": []})
         bus = FakeBus("1")
         (made,) = gateway._listeners(bus, RobotSubscription(bus, KeySpace("fleet", "r1"), Metrics()))
-        running = asyncio.create_task(made.run(gateway._incoming.part_taken_over))
+        running = asyncio.create_task(made.run(gateway._incoming.part_restored))
         async with asyncio.timeout(SOON_S):
             await made.ready.wait()  # HQ programs are accepted: there is nothing to be taken over
         running.cancel()

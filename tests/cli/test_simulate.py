@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import Coroutine
 
 import msgspec
 import pytest
 from typer.testing import CliRunner
 
+from zbridge import cli
 from zbridge.cli.app import app, default_addresses, read_drive, simulate_robot
 from zbridge.errors import ConfigError
 from zbridge.protocol.address import Address
@@ -73,3 +75,16 @@ def test_what_an_hq_program_is_to_drive_is_read(text: str, drive: tuple[float, f
 def test_what_no_robot_can_drive_is_refused(text: str) -> None:
     with pytest.raises(ConfigError, match=r"drive = .*: expected FORWARD or FORWARD,TURN, each -1 to 1"):
         read_drive(text)
+
+
+@pytest.mark.parametrize(("result", "code"), [(None, 0), (True, 0), (0, 0), (False, 1), (1, 1), (2, 2)])
+def test_a_command_ends_with_the_code_that_its_work_returns(
+    result: bool | int | None, code: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cli, "set_up_log", lambda **_: None)
+
+    async def work() -> bool | int | None:
+        return result
+
+    with contextlib.nullcontext() if code == 0 else pytest.raises(SystemExit, match=str(code)):
+        cli.run_command(work())

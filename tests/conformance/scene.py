@@ -10,12 +10,13 @@ import re
 import socket
 import struct
 from collections.abc import AsyncIterator, Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import pytest
 
 from tests.machine import Patience
 
+J = TypeVar("J")
 LONG_S = 30.0
 VERBS = {">": "send", "<": "expect", "!": "violated", "!!": "violated_once", "?": "happened"}
 Script = tuple[dict[str, Any], list[str]]
@@ -39,6 +40,13 @@ def table(lines: str, judges: dict[str, dict[str, Any]]) -> pytest.MarkDecorator
         assert name not in found, name
         found[name] = (judges[judge], re.split(r"\s*;\s*", script))
     return scripts(found)
+
+
+def bounded(judge: Callable[..., J], options: dict[str, Any]) -> J:
+    """Make a judge; ``keep`` among the options: most entries of each of its lists."""
+    options = dict(options)
+    own = {"KEEP": options.pop("keep")} if "keep" in options else {}
+    return type(judge.__name__, (judge,), own)(**options)
 
 
 class Peer:

@@ -24,7 +24,7 @@ from zbridge.metrics import Metrics
 from zbridge.security.certs import authority
 from zbridge.security.certs.authority import CertificateRequest
 from zbridge.security.certs.bundle import Packing, bundle
-from zbridge.security.certs.files import Folder, NameFiles
+from zbridge.security.files import Folder, NameFiles
 from zbridge.security.roles import Member
 
 KEY = "fleet/r1/pose"

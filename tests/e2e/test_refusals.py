@@ -26,7 +26,7 @@ from zbridge.cli.bus import list_robots
 from zbridge.errors import BusError, ConfigError
 from zbridge.security.certs import authority
 from zbridge.security.certs.authority import CertificateRequest
-from zbridge.security.certs.files import Folder
+from zbridge.security.files import Folder
 from zbridge.security.member import check_member
 from zbridge.security.roles import Member
 

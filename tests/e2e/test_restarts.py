@@ -164,8 +164,8 @@ def test_a_broken_successor_is_ended_and_the_gateway_goes_on(
     patched = bench.folder / "patched.py"
     patched.write_text(
         f"import sys; sys.path.insert(0, {str(ROOT)!r})\n"
-        "from zbridge.app.handover import outgoing, processes\n"
-        f"outgoing.START_S, outgoing.TAKE_OVER_S = {1.0 if how == 'silent' else 20.0}, 0.5\n"
+        "from zbridge.app.handover import processes, sequence\n"
+        f"sequence.START_S, sequence.TAKE_OVER_S = {1.0 if how == 'silent' else 20.0}, 0.5\n"
         f"processes.COMMAND = [sys.executable, {str(broken)!r}]\n"
         "from zbridge.cli import main\n"
         "main()\n"

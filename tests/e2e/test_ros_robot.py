@@ -14,12 +14,12 @@ from typing import Any
 import pytest
 import zenoh
 
-from gateways.ros2.conformance.strict_robot import HASHES, config
 from tests.e2e.conftest import HOST, Bench, device, listener, until
 from tests.e2e.measured.hq_judge import DRIVES, LEASE_S, Alf, Ec, Program, Tcp
 from tests.e2e.measured.ros_robot import KEY, WAYS, Scene, measure
 from tests.e2e.rigs.fragile import charges
 from tests.e2e.rigs.hq_scene import playing, ports, pushed, soon
+from tests.gateways.ros2.strict_robot import HASHES, config
 from tests.ports import free_port
 
 SCAN_KEY = f"0/scan/sensor_msgs::msg::dds_::LaserScan_/{HASHES['LaserScan']}"

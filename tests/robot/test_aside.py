@@ -99,11 +99,11 @@ async def test_a_connection_whose_end_does_no_harm_need_not_be_kept(rig: Rig, mo
 async def test_nothing_is_connected_while_another_process_may_get_the_link_also_when_served_again(rig: Rig) -> None:
     await aside(rig)
     rig.goes()
-    rig.device.hold()
+    rig.device.suspend()
     await rig.device.step_in()
     await asyncio.sleep(10.0)
     assert len(rig.links) == 1
-    await rig.device.go_on()
+    await rig.device.resume()
     await asyncio.sleep(10.0)
     assert len(rig.links) >= 2
 
@@ -151,12 +151,12 @@ async def test_a_successor_of_a_gateway_that_stands_aside_stands_aside_too(rig: 
     rig.sends(MAP)
     await aside(rig)
     await rig.device.prepare("gateway restarted", 1.0)
-    rig.device.hold()
-    given = msgpack.unpackb(msgpack.packb(rig.device.hand_over(Parcel())))
+    rig.device.suspend()
+    given = msgpack.unpackb(msgpack.packb(rig.device.export(Parcel())))
     assert given["aside"] is True
     assert given["links"][0]["connected_at"] == pytest.approx(rig.loop.time() - rig.device.standing.connected_s)
     later = Rig(bus=rig.bus)
-    later.device.take_over(given, Parcel())
+    await later.device.restore(given, Parcel())
     assert later.device.last_stop().frames == ()
     before: Any = counts(rig)
     begun = asyncio.Event()
@@ -173,10 +173,10 @@ async def test_a_successor_of_a_gateway_that_stands_aside_stands_aside_too(rig: 
 
 
 async def test_who_has_left_the_commands_to_the_next_process_says_nothing_any_more(rig: Rig) -> None:
-    rig.device.withdraw()
+    await rig.device.withdraw()
     published = counts(rig)
     await asyncio.sleep(3.0)
     assert counts(rig) == published, "it may be frozen before it learns that it has handed over"
-    await rig.device.go_on()
+    await rig.device.resume()
     await asyncio.sleep(3.0)
     assert counts(rig) > published

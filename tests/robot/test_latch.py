@@ -205,10 +205,10 @@ async def test_a_successor_knows_what_the_gateway_before_it_knew_unless_that_die
 ) -> None:
     async with established() as rig:
         await rig.device.prepare("gateway restarted", 1.0)
-        rig.device.hold()
-        given = rig.device.keep(Parcel(), Budget(1000)) if crashed else rig.device.hand_over(Parcel())
+        rig.device.suspend()
+        given = rig.device.deposit(Parcel(), Budget(1000)) if crashed else rig.device.export(Parcel())
         heir = Rig(bus=SlowBus())
-        heir.device.take_over(msgpack.unpackb(msgpack.packb(given)), Parcel())
+        await heir.device.restore(msgpack.unpackb(msgpack.packb(given)), Parcel())
         task = asyncio.ensure_future(heir.device.run(heir.settle))
         await heir.settle()
         await heir.settle()

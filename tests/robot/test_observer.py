@@ -108,21 +108,21 @@ async def test_a_link_that_holds_bytes_back_may_stand_within_a_frame(rig: Rig) -
 
 async def test_a_robot_that_is_not_established_leaves_nothing_to_go_on_with() -> None:
     async with serving(hold=False) as rig:
-        assert rig.device.keep(Parcel(), Budget(1000)) is None
+        assert rig.device.deposit(Parcel(), Budget(1000)) is None
         await rig.establish()
-        assert rig.device.keep(Parcel(), Budget(1000)) is not None
+        assert rig.device.deposit(Parcel(), Budget(1000)) is not None
 
 
 def deposited(rig: Rig, budget: Budget) -> Any:
     """Carry what a device deposits as it is carried to another process."""
-    return msgspec.msgpack.decode(msgspec.msgpack.encode(rig.device.keep(Parcel(), budget)))
+    return msgspec.msgpack.decode(msgspec.msgpack.encode(rig.device.deposit(Parcel(), budget)))
 
 
 @contextlib.asynccontextmanager
 async def heir_of(deposit: Any, *partials: Partial) -> AsyncIterator[Rig]:
     """Run the device of another process, which attaches a link when it has taken over."""
 
-    async def take_over(address: object, given: object, parcel: Parcel, conversation: Conversation) -> None:
+    async def attach(address: object, state: object, parcel: Parcel, conversation: Conversation) -> None:
         link = TimedLink(heir.loop, str(address))
         heir.links.append(link)
         heir.conversations.append(conversation)
@@ -131,8 +131,8 @@ async def heir_of(deposit: Any, *partials: Partial) -> AsyncIterator[Rig]:
     async def begin() -> None:
         assert heir.links == [], "no connection is touched before the word to go"
 
-    heir = Rig(take_over=take_over)
-    heir.device.take_over(deposit, Parcel(), partials)
+    heir = Rig(attach=attach)
+    await heir.device.restore(deposit, Parcel(), partials)
     task = asyncio.ensure_future(heir.device.run(begin))
     await heir.settle()
     yield heir
@@ -164,7 +164,7 @@ async def test_who_goes_on_publishes_again_what_the_dead_process_had_published_l
 
 async def test_nobody_is_given_the_lease_before_the_word_to_go(rig: Rig) -> None:
     heir, go = Rig(), asyncio.Event()
-    heir.device.take_over(deposited(rig, Budget(1000)), Parcel())
+    await heir.device.restore(deposited(rig, Budget(1000)), Parcel())
     task = asyncio.ensure_future(heir.device.run(go.wait))
     await asyncio.sleep(0.1)
     (reply,) = heir.ask("control/acquire/driver", packed({"who": "driver"})).replies

@@ -512,7 +512,7 @@ async def test_a_successor_is_no_rival_before_it_has_begun_and_its_claim_keeps_o
     exported = first.export()
     assert exported is not None
     second = Ownership(bus.join("1"), KEYS)
-    second.inherit(exported)
+    second.restore(exported)
     successor, _ = watched(second, Robot(True, robot.connected_at))
     await asyncio.sleep(20.0)
     first.hands_over = False  # the successor has failed, but is not gone yet
@@ -534,7 +534,7 @@ async def test_the_successor_of_one_that_had_yielded_has_yielded() -> None:
     exported = first.export()
     assert exported is not None
     second = Ownership(two.buses[0].join("2"), KEYS, asyncio.get_running_loop().time)
-    second.inherit(exported)
+    second.restore(exported)
     successor, _ = watched(second, Robot(True, 5.0))
     second.begin()
     two.watching[0].cancel()

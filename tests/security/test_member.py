@@ -17,7 +17,7 @@ from zbridge.control.context import Conditions
 from zbridge.errors import BusError, BusRefused, ConfigError
 from zbridge.security.certs import authority
 from zbridge.security.certs.authority import CertificateRequest
-from zbridge.security.certs.files import Folder
+from zbridge.security.files import Folder
 from zbridge.security.member import check_member
 from zbridge.security.roles import Member
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tests.simulated.mutants_data import DEVICE, Mutant
 
-INCOMING = "zbridge/app/handover/incoming.py"
+SEQUENCE = "zbridge/app/handover/sequence.py"
 LISTENER = "zbridge/hq/handover.py"
 SESSION = "zbridge/protocol/session_kept.py"
 
@@ -23,12 +23,12 @@ HANDOVER = (
     _mutant(
         "the gateway before reads and writes on",
         DEVICE,
-        "        for connection in self._links:\n            connection.hold()\n",
+        "        for connection in self._links:\n            connection.suspend()\n",
         "",
     ),
     _mutant(
         "a successor begins before go",
-        INCOMING,
+        SEQUENCE,
         "            await self._channel.receive(Go, GO_S)\n",
         "            pass\n",
     ),
@@ -53,11 +53,11 @@ HANDOVER = (
     _mutant(
         "HQ programs are not handed over",
         LISTENER,
-        '        for each in given["clients"]:',
+        '        for each in state["clients"]:',
         "        for each in ():",
     ),
     _mutant("a successor's listener stays shut", LISTENER, "        await self._door.open()\n", ""),
-    _mutant("the gateway before takes leave of the robot", DEVICE, "        self._released.set()\n", ""),
+    _mutant("the gateway before takes leave of the robot", DEVICE, "        self._detached.set()\n", ""),
     _mutant(
         "a gateway that ends hands over meanwhile",
         "zbridge/app/gateway.py",

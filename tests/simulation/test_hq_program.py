@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from zbridge.simulation.hq_program import LET_GO_S, NEUTRAL_S, HqProgram, run_hq_program
+from zbridge.simulation.hq_program import LET_GO_S, NEUTRAL_S, HqProgram
 
 pytestmark = pytest.mark.jumping
 
@@ -52,7 +52,7 @@ class Toy(HqProgram):
 
 async def test_it_prints_what_happens_and_drives_once_it_has_sent_neutral_for_a_while(capsys) -> None:
     toy = Toy()
-    await run_hq_program(toy, "robot", 1, (0.3, -0.2))
+    await toy.simulate("robot", 1, (0.3, -0.2))
     assert capsys.readouterr().out.splitlines() == [
         *("connecting to robot:1", "connected", "it reads no more", "is shown nothing", "sends neutral"),
         *("drives: forward 0.3, turn -0.2", "is shown a robot that moves", "died: a bad packet"),
@@ -66,7 +66,7 @@ async def test_it_prints_what_happens_and_drives_once_it_has_sent_neutral_for_a_
 @pytest.mark.parametrize(("drive", "told"), [((0.3, 0.0), ["neutral", "0.3 0.0", "neutral"]), (None, [])])
 async def test_a_program_that_is_ended_sends_neutral_before_it_leaves(drive, told: list[str], capsys) -> None:
     toy = Toy()
-    running = asyncio.create_task(run_hq_program(toy, "robot", 1, drive))
+    running = asyncio.create_task(toy.simulate("robot", 1, drive))
     await asyncio.sleep(5.0)
     running.cancel()
     with pytest.raises(asyncio.CancelledError):
@@ -78,4 +78,4 @@ async def test_a_program_that_is_ended_sends_neutral_before_it_leaves(drive, tol
 
 async def test_nobody_listening_is_an_error() -> None:
     with pytest.raises(ConnectionRefusedError):
-        await run_hq_program(Toy(ConnectionRefusedError()), "robot", 1, (1.0, 0.0))
+        await Toy(ConnectionRefusedError()).simulate("robot", 1, (1.0, 0.0))

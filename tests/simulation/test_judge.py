@@ -21,9 +21,14 @@ class Strict(Judge):
         return self._report(problem, raw, deadly=deadly)
 
 
+class Forgetful(Strict):
+    KEEP = 2
+
+
 def test_a_judge_notes_what_is_wrong_and_what_happened_within_its_bound_and_says_of_what_it_dies() -> None:
     noted: list[str] = []
-    judge = Strict(keep=2, note=noted.append)
+    judge = Forgetful()
+    judge.note = noted.append
     judge.violate("wrong")
     assert (judge.alive, judge.death) == (True, "")
     with pytest.raises(Ended, match="died: an unknown id"):
@@ -37,7 +42,7 @@ def test_a_judge_notes_what_is_wrong_and_what_happened_within_its_bound_and_says
 
 
 def test_a_fault_in_a_message_is_recorded_with_its_bytes_and_a_deadly_one_ends_the_judge() -> None:
-    judge = Strict(keep=2)
+    judge = Forgetful()
     assert not judge.report("", "01 02")
     assert judge.report("a wrong length", "01 02")
     with pytest.raises(Ended):

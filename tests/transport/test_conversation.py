@@ -208,7 +208,7 @@ async def test_a_lost_link_or_abandoning_ends_the_conversation_and_nothing_happe
     assert up.session.reason == ("abandoned" if abandoned else "closed by peer")
     up.conversation.pump()
     up.conversation.received(b"\x01a")
-    up.conversation.pause()
+    up.conversation.pause_reading()
     await asyncio.sleep(100)
     assert (up.happened, up.link.written, up.link.paused) == ([State.CLOSED], [], False)
     Rig().conversation.abandon()  # it never had a link
@@ -354,14 +354,14 @@ async def test_a_rest_ends_no_pause_that_the_bus_asked_for_and_the_bus_ends_no_r
     slow.begin()
     slow.work_s = BURST_S + 0.01
     slow.conversation.received(b"\x01a")
-    slow.conversation.pause()
+    slow.conversation.pause_reading()
     await asyncio.sleep(0.1)
     assert slow.link.paused
-    slow.conversation.resume()
+    slow.conversation.resume_reading()
     assert not slow.link.paused
     slow.conversation.received(b"\x01a")
-    slow.conversation.pause()
-    slow.conversation.resume()
+    slow.conversation.pause_reading()
+    slow.conversation.resume_reading()
     assert slow.link.paused
     slow.conversation.abandon()
     await asyncio.sleep(1.0)

@@ -13,23 +13,23 @@ from tests.transport.recorder import LOCAL, Recorder, connected, until
 from zbridge.errors import ProtocolError
 from zbridge.transport import Door, Parcel, listen
 from zbridge.transport.kernel import KERNEL
-from zbridge.transport.tcp import take_over
+from zbridge.transport.tcp import attach
 
 pytestmark = pytest.mark.both_loops
 
 
 async def test_what_came_while_a_link_was_held_is_read_once_by_who_took_it_over() -> None:
     async with connected() as pair:
-        pair.here.hold()
+        pair.here.suspend()
         pair.there.write(b"early")
         parcel = Parcel()
-        given = pair.here.hand_over(parcel)
+        given = pair.here.export(parcel)
         await asyncio.sleep(0.05)
         assert not pair.near.data
         other = Recorder()
-        pair.here.release()
+        pair.here.detach()
         await asyncio.sleep(0.05)
-        link = await take_over(given, parcel, other)
+        link = await attach(given, parcel, other)
         pair.there.write(b" and late")
         await other.until("received", received=14)
         assert other.data == b"early and late"
@@ -51,7 +51,7 @@ async def test_a_shut_door_keeps_who_comes_for_the_next_owner() -> None:
         await asyncio.sleep(0)
         with socket.create_connection((address.host, address.port)) as peer:
             parcel = Parcel()
-            other = Door(door.hand_over(parcel), parcel)
+            other = Door(door.export(parcel), parcel)
             async with listen(address, receiver, door=other) as again:
                 assert again == address
                 await asyncio.sleep(0.05)
@@ -86,7 +86,7 @@ async def test_a_connection_that_ended_before_it_was_attached_is_closed_once() -
         connection, _ = server.accept()
         peer.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # closes with a reset
     receiver = Recorder()
-    await take_over({"tcp": 0}, Parcel([connection.detach()]), receiver, Mock(wraps=KERNEL, adopt=adopt))
+    await attach({"tcp": 0}, Parcel([connection.detach()]), receiver, Mock(wraps=KERNEL, adopt=adopt))
     await receiver.until("lost")
     await asyncio.sleep(0.01)
     assert adopted[0].fileno() == -1, "its number may be that of another file by now"

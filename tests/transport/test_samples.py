@@ -81,9 +81,9 @@ async def test_to_watch_again_asks_for_the_tokens_that_are_there() -> None:
 async def test_what_comes_while_nothing_is_read_is_dropped_and_told() -> None:
     scene = Scene()
     scene.write(subscription("k"))
-    scene.link.pause()
+    scene.link.pause_reading()
     scene.other.frames("k", lambda listened: None).put(b"lost")
-    scene.link.resume()
+    scene.link.resume_reading()
     scene.metrics.count("bus_in_dropped").value += 2
     scene.link._report()
     told = [sample.count for sample in scene.read if sample.kind is SampleKind.DROPPED]

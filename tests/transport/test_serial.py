@@ -80,12 +80,12 @@ async def test_bytes_go_both_ways_at_the_configured_speed_but_for_while_paused(l
     line.link.write_datagram(b"nobody's")
     line.link.write(every_byte)
     assert await line.read(256) == every_byte
-    for call in (line.link.pause, line.link.pause):
+    for call in (line.link.pause_reading, line.link.pause_reading):
         call()
     os.write(line.fd, every_byte)
     await asyncio.sleep(0.02)
     assert not line.recorder.data
-    for call in (line.link.resume, line.link.resume):
+    for call in (line.link.resume_reading, line.link.resume_reading):
         call()
     await line.recorder.until("received", received=256)
     assert line.recorder.data == every_byte
@@ -108,7 +108,7 @@ async def test_a_line_that_takes_nothing_is_not_ready_and_what_waits_is_unacknow
 @pytest.mark.parametrize("writing", [False, True])
 async def test_an_unplugged_device_is_lost_once_with_a_reason_and_not_within_a_write(line: Line, writing: bool) -> None:
     if writing:
-        line.link.pause()
+        line.link.pause_reading()
     line.unplug()
     if writing:
         line.link.write(b"x")
@@ -117,7 +117,7 @@ async def test_an_unplugged_device_is_lost_once_with_a_reason_and_not_within_a_w
     await line.recorder.until("lost")
     assert (line.recorder.reason or "").startswith("connection lost: ")
     line.link.write(b"x")
-    for call in (line.link.pause, line.link.resume, line.link.close, line.link.abort):
+    for call in (line.link.pause_reading, line.link.resume_reading, line.link.close, line.link.abort):
         call()
     await asyncio.sleep(0)
     assert (line.link.ready, line.link.unacknowledged_s, line.recorder.calls.count("lost")) == (False, 0.0, 1)

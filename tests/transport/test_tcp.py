@@ -72,7 +72,7 @@ async def test_what_was_written_before_closing_arrives_and_a_lost_link_takes_cal
         assert (pair.near.data, pair.near.reason) == (b"last words", "closed by peer")
         assert not pair.here.ready
         pair.here.write(b"x")
-        for call in (pair.here.pause, pair.here.resume, pair.here.close, pair.here.abort):
+        for call in (pair.here.pause_reading, pair.here.resume_reading, pair.here.close, pair.here.abort):
             call()
         await asyncio.sleep(0)
         assert pair.near.calls == ["attached", "received", "lost"]
@@ -90,7 +90,7 @@ async def test_a_peer_that_breaks_off_is_noticed_with_the_reason() -> None:
 async def test_a_paused_link_reads_nothing_until_it_is_resumed_and_its_machine_is_not_silent(monkeypatch) -> None:
     async with connected() as pair:
         for _ in range(2):
-            pair.here.pause()
+            pair.here.pause_reading()
         pair.there.write(b"waits")
         await asyncio.sleep(0.05)
         assert pair.near.data == b""
@@ -98,19 +98,19 @@ async def test_a_paused_link_reads_nothing_until_it_is_resumed_and_its_machine_i
         monkeypatch.setattr(tcp, "KEEPALIVE_S", 0.0)  # as if the kernel had asked for a sign of life meanwhile
         assert 0.0 < pair.there.silent_s < SOON_S
         for _ in range(2):
-            pair.here.resume()
+            pair.here.resume_reading()
         await pair.near.until("received", received=5)
 
 
 async def test_a_peer_that_takes_nothing_makes_the_link_unready_and_writable_again_later() -> None:
     async with connected() as pair:
-        pair.there.pause()
+        pair.there.pause_reading()
         written = 0
         while pair.here.ready:
             pair.here.write(bytes(64 * 1024))
             written += 64 * 1024
             assert written < 64 * 2**20
-        pair.there.resume()
+        pair.there.resume_reading()
         await pair.near.until("writable")
         assert pair.here.ready
         await pair.far.until("received", received=written)
@@ -200,10 +200,10 @@ async def test_a_udp_port_that_is_taken_is_a_link_error_and_leaves_nothing_open(
 
 async def test_bytes_that_the_peers_machine_does_not_take_wait_for_their_acknowledgement_until_it_does() -> None:
     async with connected() as pair:
-        pair.there.pause()
+        pair.there.pause_reading()
         pair.here.write(b"x" * 2_000_000)  # more than a kernel keeps whose program reads nothing
         await until(lambda: pair.here.unacknowledged_s >= STALLED_S + 0.1)
-        pair.there.resume()
+        pair.there.resume_reading()
         await pair.far.until("received", received=2_000_000)
         await until(lambda: pair.here.unacknowledged_s == 0.0)
 
@@ -211,12 +211,12 @@ async def test_bytes_that_the_peers_machine_does_not_take_wait_for_their_acknowl
 async def test_bytes_that_arrive_do_not_wait_for_the_program_to_read_them() -> None:
     """A stalled program cannot be seen from here, as its kernel acknowledges."""
     async with connected() as pair:
-        pair.there.pause()
+        pair.there.pause_reading()
         for _ in range(30):
             pair.here.write(b"x")
             await asyncio.sleep(0.02)
         assert pair.here.unacknowledged_s <= STALLED_S
-        pair.here.pause()
+        pair.here.pause_reading()
         pair.there.write(b"x" * 10_000_000)
         await asyncio.sleep(STALLED_S + 0.1)
         assert pair.there.unacknowledged_s == 0.0, "only a robot's link is watched"
@@ -230,7 +230,7 @@ async def test_a_platform_that_tells_nothing_is_said_once_and_has_no_gate(monkey
     monkeypatch.setattr(tcp_options, "_unwatched_warned", False)
     for _ in range(2):
         async with connected() as pair:
-            pair.there.pause()
+            pair.there.pause_reading()
             pair.here.write(b"x" * 10_000_000)
             await asyncio.sleep(STALLED_S + 0.1)
             assert pair.here.unacknowledged_s == 0.0

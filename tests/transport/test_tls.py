@@ -125,7 +125,7 @@ async def test_what_the_tcp_link_tells_is_told_and_datagrams_are_lost(lab: Autho
     assert (pair.link.ready, pair.link.silent_s, pair.link.unacknowledged_s) == (False, 2.0, 0.4)
     pair.link.write_datagram(b"in the open")
     assert pair.tcp.datagrams == []
-    for call, told in ((pair.link.pause, True), (pair.link.resume, None)):
+    for call, told in ((pair.link.pause_reading, True), (pair.link.resume_reading, None)):
         call()
         assert told is None or pair.tcp.paused
 

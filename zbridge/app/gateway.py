@@ -19,14 +19,13 @@ from typing import Any
 import msgspec
 
 from zbridge.app.config import GatewayPlan
-from zbridge.app.handover import ClaimPart, Incoming, Restarts, Successor
+from zbridge.app.handover import ClaimPart, ColdStart, Incoming, Restarts, Successor
 from zbridge.app.joining import SessionUseless, watch_certificate, watch_session
 from zbridge.app.prometheus import serve_metrics
 from zbridge.app.runtime import RUNTIME, Runtime, open_audit
 from zbridge.app.serving import SERVED_ELSEWHERE, Begin, Serving
 from zbridge.bus import Bus, Handle, IncomingQuery
-from zbridge.bus.tls.files import own_certificate
-from zbridge.bus.tls.member import own_name
+from zbridge.bus.tls.files import own_certificate, own_name
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
 from zbridge.control.context import Conditions
@@ -48,7 +47,7 @@ from zbridge.robot.observer import Observer
 from zbridge.robot.ownership import Ownership
 from zbridge.robot.settings import DevicePlan
 from zbridge.tasks import together, until
-from zbridge.transport import Parcel, connect, take_over
+from zbridge.transport import Parcel, attach, connect
 from zbridge.transport.fair_share import FairShare
 
 log = logging.getLogger("zbridge.app.gateway")
@@ -92,7 +91,7 @@ class Gateway:
         self._incoming = (
             Incoming(predecessor, plan.setup, supervised=observer is not None, processes=runtime.processes)
             if predecessor is not None
-            else None
+            else ColdStart()
         )
         self.restarts = Restarts(
             plan, self._keys, self._incoming, successor, runtime.clock, runtime.processes, runtime.kernel
@@ -126,10 +125,10 @@ class Gateway:
                     await self._run(bus, audit)
                     return
                 except SessionUseless as error:
-                    self._incoming = None
+                    self._incoming = ColdStart()
                     log.error("%s", error)
                 except Exception as error:
-                    if self._incoming is not None and not self._incoming.begun.is_set():
+                    if not self._incoming.begun.is_set():
                         self._incoming.fail(str(error) if isinstance(error, ZbridgeError) else describe(error))
                     raise
                 finally:
@@ -148,14 +147,12 @@ class Gateway:
 
     async def _run(self, bus: Bus, audit: Audit, *, alone: bool = True) -> None:
         """Run all parts. alone: the bus and the metrics are this gateway's own."""
-        if self._incoming is not None:
-            await self._incoming.receive()
+        await self._incoming.receive()
         async with contextlib.AsyncExitStack() as stack:
             stack.callback(bus.watch_connected(self._on_bus).close)
-            self.restarts.bus, robot = bus, RobotSubscription(bus, self._keys, self.metrics)
+            robot = RobotSubscription(bus, self._keys, self.metrics)
             listeners = self._listeners(bus, robot)
-            taken = self._incoming.part_taken_over if self._incoming is not None else None
-            work: list[Coroutine[Any, Any, None]] = [listener.run(taken) for listener in listeners]
+            work: list[Coroutine[Any, Any, None]] = [each.run(self._incoming.part_restored) for each in listeners]
             self.restarts.listeners = [listener.handover for listener in listeners]
             certificate = own_certificate(self._plan.config.bus.tls)
             if work:
@@ -175,20 +172,18 @@ class Gateway:
 
     async def _serve_metrics(self, address: Address) -> None:
         """Serve the counters, once a predecessor has let go."""
-        given = []
-        if self._incoming is not None:
-            await self._incoming.begun.wait()
-            given = [self._runtime.kernel.adopt(self._incoming.parcel.take(n)) for n in self._incoming.state.metrics]
-        async with serve_metrics(address, self.metrics, self.missing, given) as self.restarts.metrics_sockets:
+        await self._incoming.begun.wait()
+        sockets = [self._runtime.kernel.adopt(self._incoming.parcel.take(n)) for n in self._incoming.state.metrics]
+        async with serve_metrics(address, self.metrics, self.missing, sockets) as self.restarts.metrics_sockets:
             await asyncio.Event().wait()
 
     def _listeners(self, bus: Bus, robot: RobotSubscription) -> list[Listener]:
         plans, incoming = self._plan.listeners, self._incoming
         names = listener_names(plans, self._own, bus.zid)
         self._process = process_name(names, self._own, bus.zid) if names else "gateway"
-        given: list[tuple[Exported, Parcel] | None] = [None] * len(plans)
-        if incoming is not None and incoming.state.listeners:  # a gateway that died leaves none: they are bound anew
-            given = [(each, incoming.parcel) for each in incoming.state.listeners]
+        exported: list[tuple[Exported, Parcel] | None] = [None] * len(plans)
+        if incoming.state.listeners:  # a gateway that died leaves none: they are bound anew
+            exported = [(each, incoming.parcel) for each in incoming.state.listeners]
         return [
             Listener(
                 plan,
@@ -202,7 +197,7 @@ class Gateway:
                 self._runtime.kernel,
                 self._runtime.suspended_s,
             )
-            for plan, name, each in zip(plans, names, given, strict=True)
+            for plan, name, each in zip(plans, names, exported, strict=True)
         ]
 
     def missing(self) -> tuple[str, ...]:
@@ -218,32 +213,30 @@ class Gateway:
 
     async def _robot(self, bus: Bus, audit: Audit, plan: DevicePlan) -> None:
         """Serve the robot whenever no other gateway does."""
-        self.restarts.latches = store = LatchStore(self._keys, self.conditions, self._runtime.folder)
+        store = LatchStore(self._keys, self.conditions, self._runtime.folder)
         store.load()  # the gateway that serves the robot is sent its contents
         clock, chance = self._runtime.clock, self._runtime.chance
         ownership = Ownership(
             bus, self._keys, clock, mirror=store.mirror, autonomous=lambda: store.autonomous, chance=chance
         )
-        incoming = self._incoming
-        self.restarts.claim = ClaimPart(ownership)
+        incoming, state = self._incoming, self._incoming.state
+        self.restarts.claim = claim = ClaimPart(ownership, store)
         try:
             bus.gather(self._keys.key("@rpc/**"))
-            if incoming is not None:
-                given = incoming.state
-                if given.device is not None and given.claim:
-                    ownership.inherit(given.claim)
-                    device = self._make_device(bus, audit, plan, store)
-                    device.take_over(given.device, incoming.parcel, given.partials)
+            if state.device is not None and state.claim:
+                await claim.restore(state.claim, incoming.parcel)
+                device = self._make_device(bus, audit, plan, store)
+                await device.restore(state.device, incoming.parcel, state.partials)
 
-                    async def begin(incoming: Incoming = incoming, device: Device = device) -> None:
-                        await incoming.part_taken_over()
-                        ownership.begin()
-                        device.restore_latches(store.load())  # one that came last is only in the file
+                async def begin() -> None:
+                    await incoming.part_restored()
+                    await claim.resume()
+                    device.restore_latches(store.load())  # one that came last is only in the file
 
-                    await self._serve(bus, ownership, device, store, begin)
-                elif not incoming.state.listeners:
-                    await incoming.finish()
-                await incoming.begun.wait()
+                await self._serve(bus, ownership, device, store, begin)
+            elif not state.listeners:
+                await incoming.finish()
+            await incoming.begun.wait()
             while True:
                 shown = self._show_sessions(bus, self._process) if self._plan.listeners else None
                 await ownership.take()
@@ -303,7 +296,7 @@ class Gateway:
             share=FairShare(near.part) if near is not None else None,
             shared_address=plan.shares,
             connect=partial(connect, buffer=near.buffer if near is not None else None, kernel=runtime.kernel),
-            take_over=partial(take_over, kernel=runtime.kernel),
+            attach=partial(attach, kernel=runtime.kernel),
             observer=self._observer,
             clock=runtime.clock,
             clock_ns=runtime.clock_ns,

@@ -33,7 +33,7 @@ from zbridge.host.addresses import hold_addresses
 from zbridge.host.settings import HostSettings, require_different_robots, require_one_bus
 from zbridge.host.together import Together
 from zbridge.security.member import check_member
-from zbridge.toml import read_file
+from zbridge.toml import prefixed, read_file
 
 if TYPE_CHECKING:  # loaded where there is a supervisor only
     from zbridge.app.config import GatewayPlan
@@ -92,7 +92,8 @@ def run_gateway(
         set_up_log(verbose=verbose)
     plan = load(file, tls=tls, content=content)
     hand_on_tls(tls)
-    _check(plan, file, only)
+    with prefixed(f"{file}: "):
+        _check(plan, only)
     gc.freeze()  # objects made at start-up live as long as the process; the collector skips them
     predecessor = socket.socket(fileno=take_over) if take_over is not None else None
     successor = reporter if reporter is not None else Spawn(file, verbose=verbose)
@@ -108,24 +109,19 @@ def run_gateway(
             reporter.begin()
         await until_signal(serve(), {signal.SIGUSR2: gateway.restarts.restart})
 
-    try:
+    with prefixed(f"{file}: "):
         run_loop(work())
-    except ConfigError as error:
-        raise ConfigError(f"{file}: {error}") from error
     if gateway.restarts.gone.is_set() and isinstance(successor, Spawn):
         successor.notify_systemd()
     _exit(left=gateway.left)
 
 
-def _check(plan: GatewayPlan, file: Path, only: str | None) -> None:
+def _check(plan: GatewayPlan, only: str | None) -> None:
     parts = {"device": plan.device} if plan.device else {f"hq[{n}]": part for n, part in enumerate(plan.listeners)}
     for key, part in parts.items():
         if only is not None and part.protocol.name != only:
-            raise ConfigError(f"{file}: {key}.protocol = {part.protocol.name!r}: expected {only!r}")
-    try:
-        check_member(plan)
-    except ConfigError as error:
-        raise ConfigError(f"{file}: {error}") from error
+            raise ConfigError(f"{key}.protocol = {part.protocol.name!r}: expected {only!r}")
+    check_member(plan)
 
 
 def _exit(*, left: bool) -> None:
@@ -171,6 +167,15 @@ def run_loop(work: Coroutine[Any, Any, Any]) -> Any:
     except ImportError:
         return asyncio.run(work)
     return uvloop.run(work)
+
+
+def run_command(work: Coroutine[Any, Any, bool | int | None], *, level: int = logging.ERROR) -> None:
+    """Log from ``level`` on, and run a coroutine; end the process with the code that it returns, False being 1."""
+    set_up_log(verbose=False, level=level)
+    result = run_loop(work)
+    code = int(not result) if isinstance(result, bool) else result
+    if code:
+        sys.exit(code)
 
 
 def set_up_log(*, verbose: bool, level: int = logging.INFO, robot: str = "") -> None:

@@ -10,13 +10,14 @@ from typing import Annotated
 import typer
 
 from zbridge.app import listener_template, load, robot_template, until_signal
-from zbridge.bus.tls.files import ends_soon, out_of_date, utc_now
+from zbridge.bus.tls.files import ends_soon, folder_tls, out_of_date, utc_now
 from zbridge.cli import (
     certs,
     give_up,
     hand_on_tls,
     recording_commands,
     robot_commands,
+    run_command,
     run_gateway,
     run_loop,
     run_together,
@@ -33,6 +34,7 @@ from zbridge.protocol.address import Address
 from zbridge.protocol.plugin import HqSimulation, Protocol, Simulation, find_protocol, protocol_names
 from zbridge.security.member import check_member, not_checked
 from zbridge.tasks import together
+from zbridge.toml import prefixed
 
 app = typer.Typer(
     help=__doc__,
@@ -107,13 +109,11 @@ def check(file: File, tls: FileTls = None) -> None:
     """Check a configuration and print what it would run."""
     plan = load(file, tls=tls)
     robot, parts = plan.config.robot, []
-    try:
+    with prefixed(f"{file}: "):
         require_free(plan)
         certificate = check_member(plan)
         if plan.device is not None:
             plan.device.make_robot(Metrics())
-    except ConfigError as error:
-        raise ConfigError(f"{file}: {error}") from error
     if plan.device is not None:
         parts.append(f"{plan.device.protocol.name} at {', '.join(map(str, plan.device.addresses))}")
     if plan.camera is not None:
@@ -244,12 +244,8 @@ def probe(
     """Print what a device is: from its gateway on the bus, else, with --yes, by a handshake with it."""
     from zbridge.cli.probe import probe as ask
 
-    set_up_log(verbose=False, level=logging.ERROR)
     found = find_protocol(protocol)
-    at = found.device_address(address)
-    code = run_loop(ask(bus_settings(connect, tls), found, at, realm=realm, sure=yes))
-    if code:
-        raise typer.Exit(code)
+    run_command(ask(bus_settings(connect, tls), found, found.device_address(address), realm=realm, sure=yes))
 
 
 @app.command()
@@ -262,8 +258,7 @@ def demo(
     """Show a simulated robot of each protocol, their gateways, a router and a live table; loopback only."""
     from zbridge.cli.demo import run_demo
 
-    set_up_log(verbose=False, level=logging.WARNING)
-    run_loop(run_demo(seconds, secure=secure))
+    run_command(run_demo(seconds, secure=secure), level=logging.WARNING)
 
 
 @app.command()
@@ -288,7 +283,7 @@ def router(
     ] = False,
 ) -> None:
     """Run a Zenoh router in the foreground until SIGTERM or SIGINT: with tls, each member may do what its role may."""
-    from zbridge.cli.router import folder_tls, run_router
+    from zbridge.cli.router import run_router
 
     set_up_log(verbose=False)
     given: dict[str, object] = {

@@ -38,6 +38,10 @@ _CELL = 200
 """Characters of a cell of a table, at most."""
 _MESSAGE = 20_000
 """Characters of a message that is printed as text, at most."""
+_SESSION_COLUMNS = (
+    *("robot", "process", "session", "peer", "state", "version"),
+    *("by", "in", "out", "lost", "left out", "reason"),
+)
 _SUMMED_UP = 20
 """Robots from which on a line below the table counts them."""
 _DEPTH = 32
@@ -91,22 +95,18 @@ async def list_sessions(settings: BusSettings, realm: str, *, as_json: bool) -> 
 
 
 def _session_table(tables: dict[tuple[str, str], tuple[SessionEntry, ...]]) -> Table:
-    titles = (
-        *("robot", "process", "session", "peer", "state", "version"),
-        *("by", "in", "out", "lost", "left out", "reason"),
-    )
     table = Table(box=None)
-    for title in titles:
+    for title in _SESSION_COLUMNS:
         table.add_column(title, no_wrap=title not in ("left out", "reason"), overflow="fold")
     for (robot, who), sessions in tables.items():
         for entry in sessions:
-            counters = entry.counters
-            lost = counters.get("malformed", 0) + counters.get("dropped", 0) + counters.get("refused", 0)
+            kinds = (("frames_in",), ("frames_out",), ("malformed", "dropped", "refused"))
+            counts = [str(sum(entry.counters.get(name, 0) for name in names)) for names in kinds]
             left_out = ", ".join(f"{name} {count}" for name, count in entry.left_out.items())
-            carried = [str(counters.get(name, 0)) for name in ("frames_in", "frames_out")]
             agreed = (entry.state, entry.version or "", entry.transport)
-            cells = (robot, who, entry.name, entry.peer, *agreed, *carried, str(lost), left_out, entry.reason or "")
-            table.add_row(*map(cell, cells))
+            table.add_row(
+                *map(cell, (robot, who, entry.name, entry.peer, *agreed, *counts, left_out, entry.reason or ""))
+            )
     return table
 
 
@@ -272,10 +272,8 @@ def _health_line(robots: dict[str, Health]) -> str:
     """Count the robots that are well, and name the worst of the others with their reasons."""
     ill = sorted((name for name, each in robots.items() if each.level), key=lambda name: -robots[name].level)
     parts = [f"{len(robots) - len(ill)} of {len(robots)} robots established"]
-    parts += [f"{name} {_trouble(robots[name])}" for name in ill[:_NAMED_ILL]]
+    for name in ill[:_NAMED_ILL]:
+        reasons = filter(None, (robots[name].state or "is missing", robots[name].reason))
+        parts.append(f"{name} {shown(': '.join(reasons), _REASON)}")
     parts += [f"and {len(ill) - _NAMED_ILL} more"] * (len(ill) > _NAMED_ILL)
     return "; ".join(parts)
-
-
-def _trouble(each: Health) -> str:
-    return shown(": ".join(filter(None, (each.state or "is missing", each.reason))), _REASON)

@@ -10,15 +10,16 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import msgspec
 import typer
 
 from zbridge.errors import ConfigError
 from zbridge.fleet.printable import as_json, shown
+from zbridge.security.files import Folder
 from zbridge.security.roles import OF_ROBOTS, ROLES, Member, load_roles
 
 if TYPE_CHECKING:
     from zbridge.security.certs.authority import Issued, ListedCertificate
-    from zbridge.security.certs.files import Folder
 
 app = typer.Typer(
     help="Make the certificates of a secure bus: an authority, and one certificate for each name.",
@@ -126,7 +127,8 @@ def list_names(
     entries = authority.list_names(folder, now())
     if json:
         for entry in entries:
-            say(as_json(_fields(entry)))
+            expires = entry.expires.isoformat() if entry.expires else None
+            say(as_json(msgspec.structs.asdict(entry) | {"expires": expires}))
     else:
         _print_table(entries)
 
@@ -176,12 +178,10 @@ def bundle(
         say(path)
 
 
-def opened(directory: Path) -> Folder:
+def opened(directory: Path, command: str = "zbridge certs") -> Folder:
     """Return the folder of the authority; raise ConfigError where the package ``cryptography`` is missing."""
     if importlib.util.find_spec("cryptography") is None:
-        raise ConfigError("zbridge certs needs the package cryptography: pip install 'zbridge[certs]'")
-    from zbridge.security.certs.files import Folder
-
+        raise ConfigError(f"{command} needs the package cryptography: pip install 'zbridge[certs]'")
     return Folder(directory)
 
 
@@ -198,18 +198,6 @@ def say(text: object) -> None:
 def say_issued(folder: Folder, name: str, issued: Issued) -> None:
     """Print where a certificate is, and what it is."""
     say(f"{folder.of(name).folder}: {issued.common_name}, expires {issued.expires:%Y-%m-%d}, {issued.fingerprint}")
-
-
-def _fields(entry: ListedCertificate) -> dict[str, object]:
-    return {
-        "name": entry.name,
-        "role": entry.role,
-        "robots": list(entry.robots),
-        "hosts": list(entry.hosts),
-        "expires": entry.expires.isoformat() if entry.expires else None,
-        "fingerprint": entry.fingerprint,
-        "problem": entry.problem,
-    }
 
 
 def _print_table(entries: list[ListedCertificate]) -> None:

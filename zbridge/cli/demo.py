@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
-import json
 import math
 import sys
 import tempfile
@@ -36,6 +35,7 @@ from zbridge.fleet.printable import shown
 from zbridge.fleet.topics import split_key
 from zbridge.metrics import Metrics
 from zbridge.protocol.plugin import Protocol, find_protocol, protocol_names
+from zbridge.toml import as_toml
 
 REFRESH_S = 0.5
 FIGURE: tuple[dict[str, float], ...] = ({"forward": 0.6}, {"turn": 0.5})
@@ -64,7 +64,6 @@ class LiveTable:
         self.rows = {robot: Row() for robot in robots}
 
     def take(self, sample: Sample) -> None:
-        """Take one sample from the bus."""
         split = split_key(sample.key)
         row = self.rows.get(split[1]) if split else None
         if split is None or row is None:
@@ -129,7 +128,8 @@ async def run_demo(seconds: float, *, secure: bool = False) -> None:
         await end([simulator for simulator, _ in processes])
         failed += [f"no data from {robot}" for robot, row in watch.rows.items() if not row.received]
         if seconds and failed:
-            _print_end(folder / "log")
+            for line in (folder / "log").read_text(errors="replace")[-2000:].splitlines():
+                print(shown(line), file=sys.stderr)  # noqa: T201
             raise ZbridgeError(f"{'; '.join(failed)}; the end of the processes' log is above")
 
 
@@ -137,11 +137,6 @@ def _left_out(error: ZbridgeError) -> str:
     """Print why the demo continues without a protocol; return it."""
     print(shown(f"zbridge: {error}; the demo goes on without it"), file=sys.stderr)  # noqa: T201
     return str(error)
-
-
-def _print_end(log: Path) -> None:
-    for line in log.read_text(errors="replace")[-2000:].splitlines():
-        print(shown(line), file=sys.stderr)  # noqa: T201
 
 
 def _is_whole(name: str) -> bool:
@@ -199,20 +194,11 @@ async def _robot(
         serving = f'[[hq]]\nprotocol = "{protocol}"\nlisten = "{listener}"\n' if found.hq is not None else ""
         file.write_text(
             f'[robot]\nname = "{robot}"\n'
-            f'[device]\nprotocol = "{protocol}"\nconnect = {json.dumps(addresses)}\noptions = {_inline(options)}\n'
+            f'[device]\nprotocol = "{protocol}"\nconnect = {as_toml(addresses)}\noptions = {as_toml(options)}\n'
             f"{serving}{bus}"
         )
         async with process(log, "run", str(file), state=folder) as gateway:
             yield simulator, gateway
-
-
-def _inline(value: object) -> str:
-    """Write a value as TOML: as JSON, except tables."""
-    if isinstance(value, list):
-        return f"[{', '.join(map(_inline, value))}]"
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{json.dumps(name)} = {_inline(item)}" for name, item in value.items()) + "}"
-    return json.dumps(value)
 
 
 async def _show(fleet: Fleet, watch: LiveTable, seconds: float, how: list[str]) -> None:

@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import importlib.util
 import os
 import random
 import socket
 import sys
 from collections.abc import AsyncIterator, Callable, Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO
 
@@ -22,8 +20,9 @@ import msgspec
 
 from zbridge.bus import Bus, open_bus
 from zbridge.bus.tls.files import folder_settings
+from zbridge.cli.certs import now, opened
 from zbridge.client import Fleet
-from zbridge.errors import BusError, ConfigError
+from zbridge.errors import BusError
 from zbridge.metrics import Metrics
 from zbridge.security.roles import Member
 
@@ -118,7 +117,8 @@ async def secure_bus(folder: Path, log: IO[bytes], robots: list[str]) -> AsyncIt
             f"zbridge drive {robots[0]} --tls {folder / _READER}     # an operator",
         )
         fleet = Fleet(operator, REALM, _OPERATOR)
-        yield DemoBus(endpoint, viewer, fleet, lambda robot: _table(folder / gateways[robot]), commands)
+        tables = {robot: (folder / gateway / "bus.toml").read_text("utf-8") for robot, gateway in gateways.items()}
+        yield DemoBus(endpoint, viewer, fleet, tables.__getitem__, commands)
 
 
 def make_members(folder: Path, endpoint: str, gateways: dict[str, str]) -> Path:
@@ -126,11 +126,9 @@ def make_members(folder: Path, endpoint: str, gateways: dict[str, str]) -> Path:
 
     gateways: the name of each robot's.
     """
-    if importlib.util.find_spec("cryptography") is None:
-        raise ConfigError("zbridge demo --secure needs the package cryptography: pip install 'zbridge[certs]'")
+    made, at = opened(folder / "certs", "zbridge demo --secure"), now()
     from zbridge.security.certs import authority
     from zbridge.security.certs.bundle import Packing, bundle
-    from zbridge.security.certs.files import Folder
 
     members = {
         _ROUTER: Member("router"),
@@ -139,18 +137,13 @@ def make_members(folder: Path, endpoint: str, gateways: dict[str, str]) -> Path:
         _READER: Member("operator"),
         **{name: Member("gateway", (robot,), listeners=True) for robot, name in gateways.items()},
     }
-    now, made = datetime.now(UTC).replace(microsecond=0), Folder(folder / "certs")
-    authority.init(made, now)
+    authority.init(made, at)
     for name, member in members.items():
         hosts = ("127.0.0.1",) if member.role == "router" else ()
-        authority.issue(made, authority.CertificateRequest(name, member, hosts, DAYS), now)
+        authority.issue(made, authority.CertificateRequest(name, member, hosts, DAYS), at)
     for name in members:
-        bundle(made, name, Packing(folder / name, (endpoint,)), now)
+        bundle(made, name, Packing(folder / name, (endpoint,)), at)
     return folder / _ROUTER / "roles.toml"
-
-
-def _table(folder: Path) -> str:
-    return (folder / "bus.toml").read_text(encoding="utf-8")
 
 
 @contextlib.asynccontextmanager

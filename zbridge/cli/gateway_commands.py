@@ -5,10 +5,9 @@ from __future__ import annotations
 import asyncio
 from collections import Counter
 from collections.abc import Mapping
-from functools import partial
 
 from zbridge.bus import Bus, BusSettings
-from zbridge.bus.tls.member import own_name
+from zbridge.bus.tls.files import own_name
 from zbridge.bus.tls.membership import Right, lacking
 from zbridge.cli.bus import console, errors, joined
 from zbridge.client import connect
@@ -16,7 +15,6 @@ from zbridge.client.driver import default_who
 from zbridge.client.stops import Outcome
 from zbridge.errors import BusError, NotReady, Refused
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Latch
 from zbridge.fleet.printable import shown
 from zbridge.fleet.topics import KeySpace, is_name, split_key
 
@@ -39,7 +37,8 @@ async def unlatch(settings: BusSettings, realm: str, robot: str | None) -> bool:
             return _report(await fleet.unlatch(), "unlatched", realm)
         released = await fleet[robot].unlatch()
     for latch in released:
-        console.print(shown(f"{robot}: released the stop {_described(latch)}"))
+        reason = f" ({latch.reason})" if latch.reason else ""
+        console.print(shown(f"{robot}: released the stop of {latch.who or 'somebody'}{reason}"))
     if not released:
         console.print(f"{robot}: was not latched")
     return True
@@ -76,14 +75,8 @@ def _finding(error: Exception) -> str:
     return "refused" if isinstance(error, Refused) else "did not confirm"
 
 
-def _described(latch: Latch) -> str:
-    reason = f" ({latch.reason})" if latch.reason else ""
-    return f"of {latch.who or 'somebody'}{reason}"
-
-
 ANSWER_S = 60.0
 """Longest wait for a gateway: a successor has 30 s to start."""
-_UNANSWERED = "no gateway answers"
 
 
 async def restart(settings: BusSettings, realm: str, robot: str | None, *, who: str | None = None) -> bool:
@@ -96,8 +89,6 @@ async def restart(settings: BusSettings, realm: str, robot: str | None, *, who: 
         names = [robot] if robot is not None else await _robots(bus, realm)
         keys = [KeySpace(realm, name) for name in names]
         refusals = await asyncio.gather(*(_restart_one(bus, each, who) for each in keys))
-        if _UNANSWERED in refusals:
-            refusals = await asyncio.gather(*map(partial(_explained, bus, who), keys, refusals))
     for name, refusal in zip(names, refusals, strict=True):
         if refusal is None:
             console.print(shown(f"{name}: restarted"))
@@ -108,24 +99,17 @@ async def restart(settings: BusSettings, realm: str, robot: str | None, *, who: 
     return bool(names) and not any(refusals)
 
 
-async def _explained(bus: Bus, who: str, keys: KeySpace, refusal: str | None) -> str | None:
-    """Return the refusal, or the role that this program lacks where nobody answered."""
-    if refusal != _UNANSWERED:
-        return refusal
-    return await lacking(bus.ask, keys.realm, who, keys.robot, Right.RESTART) or refusal
-
-
 async def _robots(bus: Bus, realm: str) -> list[str]:
     tokens = await bus.alive(f"{realm}/*/@alive/gateway")
     return sorted({split[1] for key in tokens if (split := split_key(key)) and is_name(split[1])})
 
 
 async def _restart_one(bus: Bus, keys: KeySpace, who: str) -> str | None:
-    """Return why a gateway was not restarted; None where it was."""
+    """Return why a gateway was not restarted, or the role that this program lacks; None where it was."""
     try:
         answers = await bus.ask(keys.key(topics.RPC_RESTART(who).path), timeout_s=ANSWER_S)
     except BusError as error:
         return str(error)
     if not answers:
-        return _UNANSWERED
+        return await lacking(bus.ask, keys.realm, who, keys.robot, Right.RESTART) or "no gateway answers"
     return next((str(answer.error) for answer in answers if answer.error is not None), None)

@@ -10,14 +10,13 @@ import time
 from collections.abc import Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
 import zbridge
 from zbridge.app import until_signal
 from zbridge.bus import BusSettings, read_key_expr
-from zbridge.bus.tls.member import own_name, own_role
+from zbridge.bus.tls.files import own_name, own_role
 from zbridge.cli.bus import console, errors, joined, print_columns
 from zbridge.client.driver import default_who
 from zbridge.errors import ConfigError, LinkError, ZbridgeError
@@ -28,6 +27,7 @@ from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.protocol.plugin import Protocol, find_protocol
 from zbridge.tasks import together
+from zbridge.toml import prefixed
 from zbridge.views.recording.capture import BusCapture, RecordPlan, publish_mark
 from zbridge.views.recording.contents import Pictures, describe_configuration
 from zbridge.views.recording.export import export_arrays, export_tables, first_ns
@@ -160,18 +160,13 @@ def show_info(path: Path, *, as_json: bool) -> None:
     summary = summarize(path)
     if not summary.messages and summary.fault == "this is no MCAP file":
         raise ConfigError(f"{path}: {summary.fault}")
-    if as_json:
-        console.print(to_json(_as_dict(summary)))
-    else:
+    if not as_json:
         _print_info(summary)
-
-
-def _as_dict(summary: Summary) -> dict[str, Any]:
-    fields: dict[str, Any] = msgspec.to_builtins(summary)
-    fields["keys"] = [
-        {**entry, "rate_hz": key.rate_hz} for entry, key in zip(fields["keys"], summary.keys, strict=True)
-    ]
-    return {**fields, "robots": summary.robots, "duration_s": summary.duration_s}
+        return
+    fields = msgspec.to_builtins(summary)
+    for entry, key in zip(fields["keys"], summary.keys, strict=True):
+        entry["rate_hz"] = key.rate_hz
+    console.print(to_json({**fields, "robots": summary.robots, "duration_s": summary.duration_s}))
 
 
 def _print_info(summary: Summary) -> None:
@@ -287,10 +282,8 @@ def _keys(player: Player) -> Iterator[None]:
 
 async def run_wire(path: Path, protocol: str, listen: list[str], robots: list[str], speed: float, realm: str) -> None:
     """Be the legacy robot until all was played, or a signal."""
-    try:
+    with prefixed("listen = ", LinkError):
         addresses = [Address.parse(text) for text in listen]
-    except LinkError as error:
-        raise ConfigError(f"listen = {error}") from error
     found = find_protocol(protocol)
     if len(addresses) > found.links:
         raise ConfigError(f"listen: a {found.name} robot has at most {found.links} links")

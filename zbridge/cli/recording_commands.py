@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from zbridge.cli import give_up, run_loop, set_up_log
+from zbridge.cli import give_up, run_command
 from zbridge.cli.options import Connect, Realm, TlsFolder, check_name
 from zbridge.client import bus_settings
 
@@ -61,7 +61,6 @@ def record(
     """Record robots, or all of them, until SIGTERM or SIGINT: every key, commands and refusals too."""
     from zbridge.cli.recording import RecordOptions, run_record
 
-    set_up_log(verbose=False, level=logging.WARNING)
     if sum(map(bool, (robots, everything, keys))) != 1:
         give_up(2, "name ROBOTs, or give --all or --keys")
     for robot in robots or ():
@@ -80,8 +79,7 @@ def record(
         buffer=buffer,
         realm=realm,
     )
-    if not run_loop(run_record(bus_settings(connect, tls), options)):
-        raise typer.Exit(1)
+    run_command(run_record(bus_settings(connect, tls), options), level=logging.WARNING)
 
 
 @app.command()
@@ -126,8 +124,7 @@ def mark(
     """Write an event into all running recordings of the realm."""
     from zbridge.cli.recording import put_mark
 
-    set_up_log(verbose=False, level=logging.ERROR)
-    run_loop(put_mark(bus_settings(connect, tls), realm, text, who or None))
+    run_command(put_mark(bus_settings(connect, tls), realm, text, who or None))
 
 
 @app.command()
@@ -149,13 +146,12 @@ def replay(
     """Replay a recording onto the bus under another name, or to a gateway as the legacy robot itself."""
     from zbridge.cli.recording import ReplayOptions, run_replay, run_wire
 
-    set_up_log(verbose=False, level=logging.WARNING)
     if bool(as_robot) != bool(listen):
         give_up(2, "--as-robot and --listen belong together")
     if as_robot:
         if hq or loop or pause or since or until:
             give_up(2, "--as-robot replays a recording once and whole: no --hq, --loop, --pause, --from, --to")
-        run_loop(run_wire(file, as_robot, listen or [], robot or [], speed, realm))
+        run_command(run_wire(file, as_robot, listen or [], robot or [], speed, realm), level=logging.WARNING)
         return
     options = ReplayOptions(
         path=file,
@@ -168,4 +164,4 @@ def replay(
         pause=pause,
         hq=tuple(hq or ()),
     )
-    run_loop(run_replay(bus_settings(connect, tls), options))
+    run_command(run_replay(bus_settings(connect, tls), options), level=logging.WARNING)

@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from zbridge.app import until_signal
-from zbridge.cli import give_up, run_loop, set_up_log
+from zbridge.cli import give_up, run_command, set_up_log
 from zbridge.cli.options import Connect, Realm, TlsFolder, check_name
 from zbridge.client import bus_settings
 
@@ -84,9 +84,8 @@ def ls(
     """List the robots on the bus, or the sessions of their gateways and listeners."""
     from zbridge.cli import bus
 
-    set_up_log(verbose=False, level=logging.ERROR)
     show = bus.list_sessions if sessions else bus.list_robots
-    run_loop(show(bus_settings(connect, tls), realm, as_json=json))
+    run_command(show(bus_settings(connect, tls), realm, as_json=json))
 
 
 @app.command()
@@ -100,12 +99,10 @@ def health(
     """Print how the robots are, for monitoring: exit code 0 ok, 1 warning, 2 critical."""
     from zbridge.cli.bus import report_health
 
-    set_up_log(verbose=False, level=logging.CRITICAL)
     if robot:
         check_name("ROBOT", robot)
-    code = run_loop(report_health(bus_settings(connect, tls), realm, robot or None, as_json=json))
-    if code:
-        raise typer.Exit(code)
+    work = report_health(bus_settings(connect, tls), realm, robot or None, as_json=json)
+    run_command(work, level=logging.CRITICAL)
 
 
 @app.command()
@@ -126,11 +123,9 @@ def echo(
     """
     from zbridge.cli import bus
 
-    set_up_log(verbose=False, level=logging.ERROR)
     settings = bus_settings(connect, tls)
     work = bus.echo(settings, key, realm=realm or None, as_json=json, count=count, seconds=seconds)
-    if run_loop(until_signal(work)) is False:
-        raise typer.Exit(1)
+    run_command(until_signal(work))
 
 
 @app.command()
@@ -146,10 +141,9 @@ def drive(
     """Drive a robot by keyboard: it moves only while a key is held down; space stops it."""
     from zbridge.cli.drive import drive_robot
 
-    set_up_log(verbose=False, level=logging.ERROR)
     check_name("ROBOT", robot)
     work = drive_robot(bus_settings(connect, tls), realm, robot, speed, who=who or None, takeover=takeover)
-    run_loop(until_signal(work))
+    run_command(until_signal(work))
 
 
 @app.command()
@@ -165,11 +159,8 @@ def stop(
     """Stop a robot, or all of them; open to everyone who can write the key."""
     from zbridge.cli.gateway_commands import stop
 
-    set_up_log(verbose=False, level=logging.ERROR)
     _check_one_or_all(robot, everything=everything)
-    settings = bus_settings(connect, tls)
-    if not run_loop(stop(settings, realm, robot or None, latch=latch, reason=reason or None)):
-        raise typer.Exit(1)
+    run_command(stop(bus_settings(connect, tls), realm, robot or None, latch=latch, reason=reason or None))
 
 
 @app.command()
@@ -183,10 +174,8 @@ def unlatch(
     """Release the latched stops of a robot, or those of the whole fleet; robots move only when somebody drives."""
     from zbridge.cli.gateway_commands import unlatch
 
-    set_up_log(verbose=False, level=logging.ERROR)
     _check_one_or_all(robot, everything=everything)
-    if not run_loop(unlatch(bus_settings(connect, tls), realm, robot or None)):
-        raise typer.Exit(1)
+    run_command(unlatch(bus_settings(connect, tls), realm, robot or None))
 
 
 @app.command()
@@ -201,10 +190,8 @@ def restart(
     """Restart a robot's gateway, or all of them: robots and HQ programs stay connected; what moves is stopped."""
     from zbridge.cli.gateway_commands import restart as ask
 
-    set_up_log(verbose=False, level=logging.ERROR)
     _check_one_or_all(robot, everything=everything)
-    if not run_loop(ask(bus_settings(connect, tls), realm, robot or None, who=who or None)):
-        raise typer.Exit(1)
+    run_command(ask(bus_settings(connect, tls), realm, robot or None, who=who or None))
 
 
 @app.command()

@@ -10,7 +10,6 @@ import msgspec
 
 from zbridge.app import until_signal
 from zbridge.bus import hear_zenoh
-from zbridge.bus.tls.files import folder_tls
 from zbridge.cli import run_loop
 from zbridge.errors import ConfigError
 from zbridge.security.router import Router, ZenohWarnings
@@ -53,6 +52,3 @@ def run_router(
     os.environ.setdefault("ZENOH_RUNTIME", RUNTIME)
     hear_zenoh(ZenohWarnings().take)
     run_loop(until_signal(Router(plan).run()))
-
-
-__all__ = ["folder_tls", "run_router", "settings_of"]

@@ -10,7 +10,7 @@ import msgspec
 
 from zbridge.app import until_signal
 from zbridge.bus import BusSettings
-from zbridge.bus.tls.member import own_name, own_role
+from zbridge.bus.tls.files import own_name, own_role
 from zbridge.cli import run_loop
 from zbridge.errors import ConfigError
 from zbridge.metrics import Metrics

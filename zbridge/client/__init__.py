@@ -18,8 +18,7 @@ from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 
 from zbridge.bus import BusSettings, Tls, open_bus
-from zbridge.bus.tls.files import folder_settings
-from zbridge.bus.tls.member import own_name
+from zbridge.bus.tls.files import folder_settings, own_name
 from zbridge.client.driver import Driver
 from zbridge.client.feed import Feed, StateFeed
 from zbridge.client.fleet import Fleet, Robot

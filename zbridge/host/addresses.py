@@ -78,7 +78,7 @@ def _forms(address: DeviceAddress, ips: Mapping[str, frozenset[str]]) -> frozens
 def _resolved(hosts: Iterable[str], within_s: float) -> dict[str, frozenset[str]]:
     """Resolve host names together: one that is slow delays none of the others, and none for longer than within_s."""
     found = {host: frozenset({_plain(host)}) for host in hosts}
-    names = [host for host in found if not _is_ip(host)][:NAMES]
+    names = [host for host in found if _ip(host) is None][:NAMES]
 
     def look_up(host: str) -> None:
         with contextlib.suppress(OSError, UnicodeError):
@@ -94,19 +94,16 @@ def _resolved(hosts: Iterable[str], within_s: float) -> dict[str, frozenset[str]
     return dict(found)
 
 
-def _is_ip(host: str) -> bool:
+def _ip(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
     try:
-        ipaddress.ip_address(host.partition("%")[0])
+        return ipaddress.ip_address(host)
     except ValueError:
-        return False
-    return True
+        return None
 
 
 def _plain(host: str) -> str:
     """Write an IP address in its one form; a name in lower case."""
-    try:
-        ip = ipaddress.ip_address(host)
-    except ValueError:
+    if (ip := _ip(host)) is None:
         return host.lower()
     mapped = ip.ipv4_mapped if isinstance(ip, ipaddress.IPv6Address) else None
     return _ANY.get(str(ip), str(mapped or ip))
@@ -120,9 +117,6 @@ class Addresses:
 
     def __init__(self) -> None:
         self._taken: dict[str, tuple[Path, bool]] = {}
-
-    def __repr__(self) -> str:
-        return f"<Addresses {len(self._taken)}>"
 
     def add(self, path: Path, forms: Iterable[str], shares: bool) -> None:
         """Enter the addresses of a file; raise ConfigError where another file has one of them."""
@@ -144,12 +138,12 @@ async def hold_addresses(plan: GatewayPlan) -> AsyncIterator[None]:
 
     One that is just leaving is waited for, :data:`LEAVE_S` at most.
     """
-    device = plan.device
+    device, robot = plan.device, plan.config.robot
     if device is None or sys.platform != "linux":
         yield
         return
     forms = await asyncio.to_thread(forms_of, device)
-    lock = AddressLock(plan.config.robot.realm, plan.config.robot.name, shares=device.shares)
+    lock = AddressLock(robot.realm, robot.name, shares=device.shares)
     until = time.monotonic() + LEAVE_S
     with contextlib.closing(lock):
         while (other := await asyncio.to_thread(lock.take, forms)) is not None:
@@ -161,9 +155,10 @@ async def hold_addresses(plan: GatewayPlan) -> AsyncIterator[None]:
 
 def require_free(plan: GatewayPlan) -> None:
     """Raise ConfigError if a gateway of this machine serves the address of a plan's robot under another name."""
-    robot = f"{plan.config.robot.realm}/{plan.config.robot.name}"
-    for form in sorted(forms_of(plan.device)) if plan.device is not None else ():
-        if (other := rival(form, robot, shares=plan.device is not None and plan.device.shares)) is not None:
+    robot, device = plan.config.robot, plan.device
+    if device is not None:
+        other = rival(sorted(forms_of(device)), f"{robot.realm}/{robot.name}", shares=device.shares)
+        if other is not None:
             raise refused(plan, other)
 
 
@@ -196,7 +191,7 @@ class AddressLock:
         """Hold these addresses, in all their forms; return who else holds one: then nothing is held."""
         with _guarded():
             wanted = list(forms)
-            other = next((found for form in wanted if (found := rival(form, self._robot, shares=self._shares))), None)
+            other = rival(wanted, self._robot, shares=self._shares)
             for form in wanted if other is None else ():
                 self._sockets.append(_bound(_name(form, self._robot, shares=self._shares)))
             return other
@@ -207,13 +202,11 @@ class AddressLock:
             self._sockets.pop().close()
 
 
-def rival(form: str, robot: str, *, shares: bool) -> AddressHolder | None:
-    """Return who holds an address for another robot; None: it is free. robot: ``<realm>/<name>``."""
+def rival(forms: Iterable[str], robot: str, *, shares: bool) -> AddressHolder | None:
+    """Return who holds one of these addresses for another robot; None: all are free. robot: ``<realm>/<name>``."""
     mine = _shortened(robot)
-    for holder in holders(form):
-        if holder.robot != mine and not (shares and holder.shares):
-            return holder
-    return None
+    others = (holder for form in forms for holder in holders(form) if holder.robot != mine)
+    return next((holder for holder in others if not (shares and holder.shares)), None)
 
 
 def holders(form: str) -> list[AddressHolder]:

@@ -137,7 +137,6 @@ class FdChannel:
 
     @classmethod
     def inherited(cls, descriptor: int) -> FdChannel:
-        """Make an end of an inherited descriptor."""
         return cls(socket.socket(fileno=descriptor))
 
     def fileno(self) -> int:

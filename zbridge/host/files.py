@@ -92,22 +92,16 @@ def check(path: Path, content: bytes) -> RobotFile:
         log.exception("%s: not checked", path)
         return RobotFile(path, content, fault=f"{path}: {describe(error)}")
     robot, device = plan.config.robot, plan.device
-    file = RobotFile(path, content, (robot.realm, robot.name))
-    if device is None:
-        return file
-    return msgspec.structs.replace(file, connect=device.addresses, shares=device.shares)
+    connect, shares = (device.addresses, device.shares) if device is not None else ((), False)
+    return RobotFile(path, content, (robot.realm, robot.name), connect=connect, shares=shares)
 
 
 def located(files: Iterable[RobotFile]) -> list[RobotFile]:
     """Resolve the addresses of files that came or changed, all at once: host names may take RESOLVE_S."""
     files = list(files)
     found = resolve(address for file in files if not file.forms for address in file.connect)
-    return [
-        file
-        if file.forms
-        else msgspec.structs.replace(file, forms=frozenset[str]().union(*(found[each] for each in file.connect)))
-        for file in files
-    ]
+    forms = (file.forms or frozenset[str]().union(*(found[each] for each in file.connect)) for file in files)
+    return [msgspec.structs.replace(file, forms=each) for file, each in zip(files, forms, strict=True)]
 
 
 def compare(running: Mapping[Path, RobotFile], seen: Iterable[RobotFile]) -> Changes:
@@ -182,9 +176,6 @@ class Follower:
         """Files whose check failed, and when."""
         self._reported = dict(reported or {})
 
-    def __repr__(self) -> str:
-        return f"<Follower of {', '.join(map(str, self._sources))}>"
-
     def poll(self, running: Mapping[Path, RobotFile], *, twice: bool = True) -> Changes:
         """Read what may have changed; raise ConfigError if a directory cannot be read.
 
@@ -201,7 +192,9 @@ class Follower:
             waiting |= {path: file for path, file in running.items() if path in self._shown and path not in shown}
         self._shown = shown
         changes = compare(running, [*located(steady), *waiting.values()])
-        return msgspec.structs.replace(changes, faulty=tuple(self._new_faults(changes.faulty)))
+        new = tuple(file for file in changes.faulty if self._reported.get(file.path) != file.fault)
+        self._reported = {file.path: file.fault for file in changes.faulty}
+        return msgspec.structs.replace(changes, faulty=new)
 
     def _again(self, path: Path, running: RobotFile | None) -> RobotFile:
         """Read a file; one that is as it runs is not checked again, a faulty one only every :data:`CHECK_AGAIN_S`."""
@@ -219,9 +212,3 @@ class Follower:
         if file.fault is not None:
             self._faulty[path] = (now, file)
         return file
-
-    def _new_faults(self, faulty: Iterable[RobotFile]) -> list[RobotFile]:
-        faults = {file.path: file.fault for file in faulty}
-        new = [file for file in faulty if self._reported.get(file.path) != file.fault]
-        self._reported = dict(faults)
-        return new

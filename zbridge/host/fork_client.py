@@ -128,25 +128,18 @@ class _Server:
         asyncio.get_running_loop().add_reader(channel.fileno(), self._receive)
 
     @classmethod
-    def start(cls, command: Sequence[str], stamp: Installation) -> _Server:
-        """Start one; raise OSError."""
-        channel, far = FdChannel.pair()
-        environment = {**os.environ, **ONE_THREAD}
-        for name in NOT_INHERITED:
-            environment.pop(name, None)
-        with far:
-            try:
-                process = subprocess.Popen(
-                    [*command, str(far.fileno())],
-                    pass_fds=[far.fileno()],
-                    stdin=subprocess.DEVNULL,
-                    env=environment,
-                    start_new_session=True,
-                )
-            except OSError:
-                channel.close()
-                raise
-        return cls(process, channel, stamp)
+    async def start(cls, command: Sequence[str], stamp: Installation) -> _Server:
+        """Start one, and wait until it can fork; raise NotReady with the reason."""
+        try:
+            server = cls(*_spawned(command), stamp)
+        except OSError as error:
+            raise NotReady(f"the fork server did not start: {error.strerror or error}") from error
+        answer = await server._answer(READY_S)
+        if not isinstance(answer, Ready) or answer.threads != 1:
+            server.kill()
+            more = f": it has {answer.threads} threads" if isinstance(answer, Ready) else ""
+            raise NotReady(f"the fork server did not start{more}")
+        return server
 
     @classmethod
     def resume(cls, state: ServerState) -> _Server:
@@ -160,13 +153,6 @@ class _Server:
     @property
     def state(self) -> ServerState:
         return ServerState(self.pid, self._channel.fileno(), self.stamp.digest)
-
-    async def ready(self) -> None:
-        """Wait until it can fork; raise NotReady with the reason if it cannot."""
-        answer = await self._answer(READY_S)
-        if not isinstance(answer, Ready) or answer.threads != 1:
-            more = f": it has {answer.threads} threads" if isinstance(answer, Ready) else ""
-            raise NotReady(f"the fork server did not start{more}")
 
     async def fork(self, request: Fork, descriptors: Sequence[int]) -> int:
         """Fork a gateway and return its process id; raise NotReady with the reason."""
@@ -206,7 +192,6 @@ class _Server:
             self._channel.close()
 
     def kill(self) -> None:
-        """End it now."""
         self.close()
         with contextlib.suppress(ProcessLookupError):
             self._process.kill()
@@ -237,7 +222,6 @@ class ForkClient:
 
     @property
     def pid(self) -> int | None:
-        """The process id of the fork server."""
         return self._server.pid if self._server is not None else None
 
     @property
@@ -305,7 +289,7 @@ class ForkClient:
                 return
             log.info("the installation has changed: its code is loaded")
         try:
-            server = await _started(self._command, stamp)
+            server = await _Server.start(self._command, stamp)
         except NotReady as error:
             if old is None or not old.alive:
                 raise
@@ -318,7 +302,6 @@ class ForkClient:
             self._leaving.append(old)
 
     def close(self) -> None:
-        """End the fork server."""
         for each in (self._server, *self._leaving):
             if each is not None:
                 each.kill()
@@ -342,18 +325,21 @@ def _in_memory(content: bytes) -> Iterator[int]:
         os.close(descriptor)
 
 
-async def _started(command: Sequence[str], stamp: Installation) -> _Server:
-    """Start a fork server and wait until it can fork; raise NotReady with the reason."""
-    try:
-        server = _Server.start(command, stamp)
-    except OSError as error:
-        raise NotReady(f"the fork server did not start: {error.strerror or error}") from error
-    try:
-        await server.ready()
-    except NotReady:
-        server.kill()
-        raise
-    return server
+def _spawned(command: Sequence[str]) -> tuple[subprocess.Popen[bytes], FdChannel]:
+    """Start a fork server, and give our end of its channel; raise OSError."""
+    environment = {name: value for name, value in os.environ.items() if name not in NOT_INHERITED}
+    channel, far = FdChannel.pair()
+    with far, contextlib.ExitStack() as undo:
+        undo.callback(channel.close)
+        process = subprocess.Popen(
+            [*command, str(far.fileno())],
+            pass_fds=[far.fileno()],
+            stdin=subprocess.DEVNULL,
+            env={**environment, **ONE_THREAD},
+            start_new_session=True,
+        )
+        undo.pop_all()
+    return process, channel
 
 
 def fork_server_command() -> list[str]:

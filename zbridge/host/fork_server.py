@@ -85,10 +85,8 @@ def threads() -> int:
 
 def _import_all() -> None:
     for name in IMPORTED:
-        try:
+        with contextlib.suppress(ImportError):
             import_module(name)
-        except ImportError:
-            continue
     for name in protocol_names():
         with contextlib.suppress(Exception):  # its own gateways say why; they share what the first check makes
             find_protocol(name)
@@ -146,9 +144,6 @@ def _be_gateway(request: Fork, descriptors: list[int], run: Run) -> NoReturn:
 
 
 def _close_others(open_descriptors: set[int]) -> None:
-    for number in [int(name) for name in os.listdir("/proc/self/fd")]:
-        if number not in open_descriptors:
-            try:
-                os.close(number)
-            except OSError:  # the descriptor by which the folder was listed
-                continue
+    for number in {int(name) for name in os.listdir("/proc/self/fd")} - open_descriptors:
+        with contextlib.suppress(OSError):  # the descriptor by which the folder was listed
+            os.close(number)

@@ -48,9 +48,6 @@ class MemoryWriter:
         self._map = mmap.mmap(self.descriptor, MEMORY_BYTES)
         self._area = 0
 
-    def __repr__(self) -> str:
-        return f"<MemoryWriter area {self._area}>"
-
     def close_descriptor(self) -> None:
         """Close the descriptor: the supervisor has its own."""
         os.close(self.descriptor)
@@ -84,7 +81,6 @@ class MemoryWriter:
         self._area = area
 
     def close(self) -> None:
-        """Unmap the memory."""
         self._map.close()
 
 
@@ -96,9 +92,6 @@ class MemoryReader:
         if os.fstat(descriptor).st_size != MEMORY_BYTES:
             raise ValueError("shared memory of another version")
         self._map = mmap.mmap(descriptor, MEMORY_BYTES, prot=mmap.PROT_READ)
-
-    def __repr__(self) -> str:
-        return f"<MemoryReader {self.descriptor}>"
 
     def is_touched(self, link: int) -> bool:
         """Whether the process has read from this link."""

@@ -62,9 +62,6 @@ class Together:
         self._neighbourhood = Neighbourhood(host.share, bytearray(SHARED_READ_BYTES))
         self._tasks: dict[str, asyncio.Task[None]] = {}
 
-    def __repr__(self) -> str:
-        return f"<Together {len(self._tasks)} gateways>"
-
     def __len__(self) -> int:
         return len(self._tasks)
 
@@ -148,8 +145,3 @@ class Together:
                 await Gateway(plan, metrics).run_on(bus, self._neighbourhood)
         finally:
             await bus.close()
-
-
-async def run_together(plans: Mapping[str, GatewayPlan], host: HostSettings | None = None) -> None:
-    """Serve the robots of these plans in this process until cancelled; see :class:`Together`."""
-    await Together(plans, host or HostSettings(together=True)).run()

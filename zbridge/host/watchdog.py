@@ -45,7 +45,6 @@ class Watchdog(msgspec.Struct):
     heartbeats: int = msgspec.field(default=0, name="beats")
 
     def heartbeat(self, now: float, *, driven: bool) -> None:
-        """Note a heartbeat."""
         self.heartbeats += 1
         self.last, self.extension_s = now, 0.0
         self.timeout_s = DRIVEN_S if driven else IDLE_S
@@ -60,7 +59,6 @@ class Watchdog(msgspec.Struct):
         return self.last + self.timeout_s + self.extension_s
 
     def silent_s(self, now: float) -> float:
-        """Give the seconds since the last heartbeat."""
         return now - self.last
 
 

@@ -122,34 +122,34 @@ class Client:
     # A restart
 
     @property
-    def stays(self) -> str | None:
+    def blocker(self) -> str | None:
         """Why the program's connection cannot be handed to another process now; None where it can."""
-        return self.conversation.stays
+        return self.conversation.blocker
 
     def export(self, parcel: Parcel) -> Exported:
-        """Put the connection of a held conversation into a parcel; describe the client."""
+        """Put the connection of a suspended conversation into a parcel; describe the client."""
         return {
             "number": self.number,
             "host": self.host,
             "begun": self.begun,
             "operator": self.operator.export(),
-            **self.conversation.hand_over(parcel),
+            **self.conversation.export(parcel),
         }
 
-    def resume(self, given: Exported, why: str) -> None:
+    def restore(self, state: Exported, why: str) -> None:
         """Be the client that another process served: its session is restored. It owes neutral."""
-        self.begun = bool(given["begun"])
-        self.operator.resume(given["operator"], why)
-        self.conversation.held = True
+        self.begun = bool(state["begun"])
+        self.operator.restore(state["operator"], why)
+        self.conversation.suspended = True
 
-    def go_on(self) -> None:
+    def resume(self) -> None:
         """Read and write; carry out what the side keeps of this client in its time."""
-        self.conversation.go_on()
+        self.conversation.resume()
         self._set_timer(self._context.side.deadline(self.session))
 
-    def release(self) -> None:
+    def detach(self) -> None:
         """Forget the client, which another process serves now: its program notices nothing."""
-        self.conversation.release()
+        self.conversation.detach()
         self.close()
 
     def sweep(self) -> None:

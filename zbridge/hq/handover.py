@@ -1,9 +1,8 @@
 """How one listener is handed to another process, and taken over there, with all its clients. Knows no protocol.
 
-Theory of operation. :meth:`ListenerHandover.prepare` takes the robot from every client and waits until each connection
-can be handed over; those that never can (tls) are closed by :meth:`ListenerHandover.release`. From
-:meth:`ListenerHandover.hold` on nobody is accepted, read or written: the kernel keeps what comes. The other process
-calls :meth:`ListenerHandover.take_over`, and :meth:`ListenerHandover.go_on` when it is alone.
+Theory of operation. :class:`~zbridge.transport.transferable.Transferable` has the order of the steps.
+:meth:`ListenerHandover.prepare` takes the robot from every client and waits until each connection can be handed over;
+those that never can (tls) are closed by :meth:`ListenerHandover.detach`.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from zbridge.hq.context import ListenerContext
 from zbridge.protocol.kept import Exported
 from zbridge.protocol.session import Session
 from zbridge.protocol.session_table import ClientIds
-from zbridge.transport import Accepted, Conversation, Door, Link, Parcel
+from zbridge.transport import Accepted, Conversation, Door, Link, Parcel, Transferable
 
 RESTARTED = "gateway restarted"
 """Why clients lose the robot, and must send neutral."""
@@ -35,23 +34,23 @@ _TURNS = 3
 Make = Callable[[int, str, Session[Any]], Client]
 
 
-class ListenerHandover:
+class ListenerHandover(Transferable):
     """The handover of one listener. door: its sockets. make: makes a client of a number, a host and a session."""
 
     def __init__(
         self, context: ListenerContext, door: Door, clients: dict[int, Client], numbers: ClientIds, make: Make
     ) -> None:
-        self.held = False
+        self.suspended = False
         """Whether clients are neither read nor written nor ended."""
-        self.released = asyncio.Event()
+        self.detached = asyncio.Event()
         """Set when another process has the listener."""
         self._context = context
         self._door = door
         self._clients = clients
         self._numbers = numbers
         self._make = make
-        self._given: list[tuple[Client, object, tuple[str, int] | None]] = []
-        """Clients that were taken over and are not yet attached: number of the descriptor, source of datagrams."""
+        self._restored: list[tuple[Client, object, tuple[str, int] | None]] = []
+        """Clients that were restored and are not yet attached: number of the descriptor, source of datagrams."""
 
     def __repr__(self) -> str:
         return f"<ListenerHandover of {self._context.name}, {len(self._clients)} clients>"
@@ -67,9 +66,9 @@ class ListenerHandover:
                 client.tell(f"not driving: {reason}")
                 client.let_go(reason)
         until = self._context.clock() + within_s
-        while waiting := [client for client in self._clients.values() if _stays(client)]:
+        while waiting := [client for client in self._clients.values() if _blocker(client)]:
             if self._context.clock() >= until:
-                names = "; ".join(f"client {client.number}: {_stays(client)}" for client in waiting[:3])
+                names = "; ".join(f"client {client.number}: {_blocker(client)}" for client in waiting[:3])
                 raise NotReady(f"{self._context.name}: {names}")
             await asyncio.sleep(_LOOK_S)
 
@@ -79,80 +78,77 @@ class ListenerHandover:
         for _ in range(_TURNS):
             await asyncio.sleep(0)
 
-    def hold(self) -> None:
+    def suspend(self) -> None:
         """Read and write nothing from now on."""
-        self.held = True
-        self._door.hold()
+        self.suspended = True
+        self._door.suspend()
         for client in self._clients.values():
-            client.conversation.hold()
+            client.conversation.suspend()
 
-    def hand_over(self, parcel: Parcel) -> Exported:
-        """Put the sockets into a parcel; describe the listener and its clients. To be called while held."""
+    def export(self, parcel: Parcel) -> Exported:
+        """Put the sockets into a parcel; describe the listener and its clients."""
         context = self._context
         return {
             "name": context.name,
             "there": context.robot.view.missing is None,
-            "door": self._door.hand_over(parcel),
+            "door": self._door.export(parcel),
             "numbers": self._numbers.export(),
             "side": context.side.export(),
-            "clients": [self._client(client, parcel) for client in self._clients.values() if client.stays is None],
+            "clients": [self._client(client, parcel) for client in self._clients.values() if client.blocker is None],
         }
 
     def _client(self, client: Client, parcel: Parcel) -> Exported:
         assert client.conversation.link is not None
         return {**client.export(parcel), "source": self._door.source(client.conversation.link)}
 
-    def withdraw(self) -> None:
-        """Do nothing: a listener takes no commands from the bus."""
-
-    async def release(self) -> None:
+    async def detach(self) -> None:
         """Give up what another process has now; close the clients that could not be handed over."""
-        left = [client for client in self._clients.values() if client.conversation.stays is not None]
+        left = [client for client in self._clients.values() if client.conversation.blocker is not None]
         for client in tuple(self._clients.values()):
             if client in left:
-                client.conversation.held = False
+                client.conversation.suspended = False
                 client.conversation.close(RESTARTED)
             else:
-                client.release()
+                client.detach()
         if left:
             await asyncio.wait({client.conversation.ended for client in left}, timeout=LEAVE_S)
         self._door.close()
-        self.released.set()
+        self.detached.set()
 
     # The process that comes
 
-    async def take_over(self, given: Exported, parcel: Parcel) -> None:
-        """Restore the clients of another process, which :meth:`go_on` attaches; raise ProtocolError."""
+    async def restore(self, state: Exported, parcel: Parcel) -> None:
+        """Restore the clients of another process, which :meth:`resume` attaches; raise ProtocolError."""
         context = self._context
-        self.held = True
+        self.suspended = True
         patience = context.clock() + VIEW_S
-        while given["there"] and context.robot.view.missing is not None and context.clock() < patience:  # noqa: ASYNC110
+        while state["there"] and context.robot.view.missing is not None and context.clock() < patience:  # noqa: ASYNC110
             await asyncio.sleep(_LOOK_S)
-        context.side.restore(given["side"])
-        self._numbers.restore(given["numbers"])
-        for each in given["clients"]:
-            self._restore(each)
+        context.side.restore(state["side"])
+        self._numbers.restore(state["numbers"])
+        for each in state["clients"]:
+            self._restore_client(each)
         self._numbers.keep(self._clients, context.clock())
 
-    def _restore(self, given: Exported) -> None:
+    def _restore_client(self, state: Exported) -> None:
         try:
-            number, host = msgspec.convert(given["number"], int), msgspec.convert(given["host"], str)
-            source = msgspec.convert(given["source"], tuple[str, int] | None)
+            number, host = msgspec.convert(state["number"], int), msgspec.convert(state["host"], str)
+            source = msgspec.convert(state["source"], tuple[str, int] | None)
         except (KeyError, msgspec.ValidationError) as error:
             raise ProtocolError(f"a client of {self._context.name}: {error}") from error
         session = self._context.side.session(number, self._context.limits)
-        session.restore(given["session"])
+        session.restore(state["session"])
         client = self._make(number, host, session)
-        client.resume(given, RESTARTED)
-        self._given.append((client, given["link"].get("tcp"), source))
+        client.restore(state, RESTARTED)
+        self._restored.append((client, state["link"].get("tcp"), source))
 
-    async def go_on(self) -> None:
-        """Read, write and accept: again, or for the first time with what was taken over."""
-        self.held = False
+    async def resume(self) -> None:
+        """Read, write and accept: again, or for the first time with what was restored."""
+        self.suspended = False
         for client in tuple(self._clients.values()):
-            client.go_on()
-        given, self._given = self._given, []
-        for client, number, source in given:
+            client.resume()
+        restored, self._restored = self._restored, []
+        for client, number, source in restored:
             try:
                 await self._door.admit(number, Accepted(_attached(client.conversation)), source)
             except (OSError, ProtocolError) as error:
@@ -160,10 +156,10 @@ class ListenerHandover:
         await self._door.open()
 
 
-def _stays(client: Client) -> str | None:
+def _blocker(client: Client) -> str | None:
     """Return why a client that could be handed over cannot be yet."""
     link = client.conversation.link
-    return client.stays if link is not None and link.stays is None and not client.session.over else None
+    return client.blocker if link is not None and link.blocker is None and not client.session.over else None
 
 
 def _attached(conversation: Conversation) -> Callable[[Link], Conversation]:

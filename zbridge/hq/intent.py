@@ -199,7 +199,7 @@ class Intent:
         self._hold_back(why)
         self._handle(Input.REFUSED)
 
-    def resume(self, mode: str, why: str) -> None:
+    def restore(self, mode: str, why: str) -> None:
         """Go on, owing neutral, with the mode that the program chose in another process."""
         self.mode, self.held_back = mode, why
 

@@ -47,7 +47,7 @@ class Listener:
     """Serves the clients of one ``[[hq]]`` until cancelled.
 
     name: of the listener on the bus. clock: seconds on the event loop's time line, by default the loop's own.
-    given: the listener as another process handed it over, and its sockets. clock_ms: the raw clock, which dates
+    exported: the listener as another process exported it, and its sockets. clock_ms: the raw clock, which dates
     commands. kernel: of this machine, or a simulated one. suspended_s: for how long the machine was suspended so far.
     """
 
@@ -59,12 +59,12 @@ class Listener:
         sessions: SessionTable,
         metrics: Metrics,
         clock: Callable[[], float] | None = None,
-        given: tuple[Exported, Parcel] | None = None,
+        exported: tuple[Exported, Parcel] | None = None,
         clock_ms: Callable[[], float] = raw_ms,
         kernel: Kernel = KERNEL,
         suspended_s: Callable[[], float] = suspended_s,
     ) -> None:
-        self._given = given
+        self._exported = exported
         self._suspended_s = suspended_s
         self._clock_ms = clock_ms
         self.name = name
@@ -88,18 +88,18 @@ class Listener:
         if (tls := plan.tls) is not None:
             self._secured = lambda receiver: TlsLink(receiver, tls, plan.settings.handshake_s)
         self._closing = False
-        self._door = Door(given[0]["door"], given[1], kernel) if given is not None else Door(kernel=kernel)
+        self._door = Door(exported[0]["door"], exported[1], kernel) if exported is not None else Door(kernel=kernel)
         self.handover = ListenerHandover(context, self._door, self.clients, self._numbers, self._add)
         """How the listener is handed to another process."""
 
     def __repr__(self) -> str:
         return f"<Listener {self.name} {self.address}, {len(self.clients)} clients>"
 
-    async def run(self, taken: Callable[[], Awaitable[None]] | None = None) -> None:
+    async def run(self, begin: Callable[[], Awaitable[None]] | None = None) -> None:
         """Listen until cancelled; then close every client and give the robot back. Raises LinkError.
 
-        Returns where another process has taken the listener over. ``taken``: of a listener that was given; called when
-        everything was taken over, and waited for before anything is read or written.
+        Returns where another process has taken the listener over. ``begin``: of a listener that was handed over; called
+        when everything is restored, and waited for before anything is read or written.
         """
         self._broadcast.begin()
         async with listen(
@@ -110,18 +110,18 @@ class Listener:
             secured=self._secured,
             door=self._door,
         ) as self.address:
-            if self._given is not None and taken is not None:
-                await self.handover.take_over(*self._given)
+            if self._exported is not None and begin is not None:
+                await self.handover.restore(*self._exported)
                 self._broadcast.follow_wanted()
-                await taken()
+                await begin()
                 self._context.freeze.begin(self._clock())
-                await self.handover.go_on()
+                await self.handover.resume()
             log.info("%s: HQ programs connect at %s", self.name, self.address)
             self.ready.set()
             try:
                 await self._attend()
             finally:
-                if self.handover.released.is_set():
+                if self.handover.detached.is_set():
                     self._refusals.close()
                 else:
                     await asyncio.shield(self._leave())
@@ -152,10 +152,10 @@ class Listener:
     async def _attend(self) -> None:
         freeze, sweep_at = self._context.freeze, self._clock() + SWEEP_S
         freeze.begin(self._clock())
-        while not self.handover.released.is_set():
+        while not self.handover.detached.is_set():
             await asyncio.sleep(ATTEND_S)
             freeze.beat(self._clock())
-            if self.handover.held:
+            if self.handover.suspended:
                 continue
             for client in tuple(self._active):
                 client.tick()

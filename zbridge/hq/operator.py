@@ -137,10 +137,10 @@ class Operator:
         """Write what outlives a restart: the control mode. The lease does not."""
         return {"mode": self.intent.mode, "chose": self._chose_mode}
 
-    def resume(self, state: Exported, why: str) -> None:
+    def restore(self, state: Exported, why: str) -> None:
         """Go on for a program that another process served; it must send neutral before it drives."""
         self._chose_mode = bool(state["chose"])
-        self.intent.resume(str(state["mode"]), why)
+        self.intent.restore(str(state["mode"]), why)
 
     def close(self) -> None:
         """Release the robot: the client is gone; idempotent."""

@@ -21,15 +21,15 @@ from zbridge.protocol.kept import Budget, Exported
 from zbridge.protocol.session import Session, State
 from zbridge.protocol.session_table import Backoff, SessionTable
 from zbridge.robot.wire_tap import WireTap
-from zbridge.transport import Conversation, Link, Parcel, take_over
+from zbridge.transport import Conversation, Link, Parcel, attach
 from zbridge.transport.fair_share import FairShare
 
 log = logging.getLogger("zbridge.link")
 
 Connect = Callable[[DeviceAddress, Conversation], Any]
 """``await connect(address, receiver)``: raises LinkError where there is no connection to be had."""
-TakeOver = Callable[[DeviceAddress, Exported, Parcel, Conversation], Any]
-"""``await take_over(address, given, parcel, receiver)``: raises ProtocolError, OSError."""
+Attach = Callable[[DeviceAddress, Exported, Parcel, Conversation], Any]
+"""``await attach(address, state, parcel, receiver)``: raises ProtocolError, OSError."""
 
 _STATES: dict[State, RobotState] = {
     State.CONNECTING: "connecting",
@@ -64,7 +64,7 @@ class Hooks(msgspec.Struct, frozen=True):
     """Called when a link is up (True), and when it is gone (False)."""
     read: Callable[[], object] = lambda: None
     """Called when the bytes of a read have been handled."""
-    take_over: TakeOver = take_over
+    attach: Attach = attach
     chance: Callable[[], float] = random.random
     """Between 0 and 1."""
     shared: bool = False
@@ -102,17 +102,17 @@ class Links:
             if connection.conversation is not None:
                 connection.conversation.pump()
 
-    def pause(self) -> None:
-        """Read nothing until :meth:`resume`."""
+    def pause_reading(self) -> None:
+        """Read nothing until :meth:`resume_reading`."""
         for connection in self._connections:
             if connection.conversation is not None:
-                connection.conversation.pause()
+                connection.conversation.pause_reading()
 
-    def resume(self) -> None:
+    def resume_reading(self) -> None:
         """Read again."""
         for connection in self._connections:
             if connection.conversation is not None:
-                connection.conversation.resume()
+                connection.conversation.resume_reading()
 
 
 class Connection:
@@ -129,11 +129,12 @@ class Connection:
         self._ending = False
         self._link: Link | None = None
         self._free = asyncio.Event()
-        """Cleared while held or muted: nothing is connected then."""
+        """Cleared while suspended or muted: nothing is connected then."""
         self._free.set()
-        self._held = False
+        self._suspended = False
         """Whether another process may get the link."""
-        self._given: tuple[Exported, Parcel] | None = None
+        self._restored: tuple[Exported, Parcel] | None = None
+        """The link of another process, until it is attached."""
         self._muted = False
         self._wire = WireTap(label)
 
@@ -177,61 +178,61 @@ class Connection:
         self._set_free()
 
     def _set_free(self) -> None:
-        (self._free.clear if self._held or self._muted else self._free.set)()
+        (self._free.clear if self._suspended or self._muted else self._free.set)()
 
     # A restart
 
     @property
-    def stays(self) -> str | None:
+    def blocker(self) -> str | None:
         """Why the link cannot be handed to another process now; None where it can, or where there is none."""
         conversation = self.conversation
         if conversation is None:
             return None
         if conversation.session.outbox.hurried:
             return "the stop is not yet written"
-        return conversation.stays
+        return conversation.blocker
 
-    def hold(self) -> None:
-        """Read, write and connect nothing until :meth:`go_on`."""
-        self._held = True
+    def suspend(self) -> None:
+        """Read, write and connect nothing until :meth:`resume`."""
+        self._suspended = True
         self._set_free()
         if self.conversation is not None:
-            self.conversation.hold()
+            self.conversation.suspend()
 
-    async def go_on(self) -> None:
-        """Go on after :meth:`hold`, or attach what was taken over: from now on this process has the link."""
-        self._held = False
+    async def resume(self) -> None:
+        """Continue after :meth:`suspend`, or attach what was restored: from now on this process has the link."""
+        self._suspended = False
         self._set_free()
-        given, self._given = self._given, None
+        restored, self._restored = self._restored, None
         if self.conversation is None:
             return
-        self.conversation.go_on()
-        if given is not None:
+        self.conversation.resume()
+        if restored is not None:
             try:
-                await self._hooks.take_over(self.address, *given, self.conversation)
+                await self._hooks.attach(self.address, *restored, self.conversation)
             except (OSError, ProtocolError) as error:
                 self.conversation.lost(str(error))
 
-    def hand_over(self, parcel: Parcel, budget: Budget | None = None) -> Exported | None:
+    def export(self, parcel: Parcel, budget: Budget | None = None) -> Exported | None:
         """Put the connection into a parcel, and describe its conversation; None where there is none."""
-        return self.conversation.hand_over(parcel, budget) if self.conversation is not None else None
+        return self.conversation.export(parcel, budget) if self.conversation is not None else None
 
-    def take_over(self, given: Exported | None, parcel: Parcel) -> None:
-        """Restore the conversation of another process, which :meth:`go_on` attaches; raise ProtocolError."""
-        if given is None:
+    def restore(self, state: Exported | None, parcel: Parcel) -> None:
+        """Restore the conversation of another process, which :meth:`resume` attaches; raise ProtocolError."""
+        if state is None:
             return
         session = self._hooks.session()
-        session.restore(given["session"])
+        session.restore(state["session"])
         self.state, self.reason = _STATES[session.state], session.busy or session.reason
         self.conversation = conversation = self._make_conversation(session)
-        conversation.held, conversation.connected_at = True, given["connected_at"]
-        self._given = (given["link"], parcel)
+        conversation.suspended, conversation.connected_at = True, state["connected_at"]
+        self._restored = (state["link"], parcel)
 
-    def release(self) -> None:
+    def detach(self) -> None:
         """Give up the connection, which another process has now."""
         self._ending = True
         if self.conversation is not None:
-            self.conversation.release()
+            self.conversation.detach()
 
     def status(self) -> LinkStatus:
         """Return the entry of this link on ``status``."""
@@ -245,14 +246,14 @@ class Connection:
     async def _converse(self) -> tuple[str, bool]:
         """Hold one conversation to its end; return why it ended and whether it was ever established."""
         hooks, conversation = self._hooks, self.conversation
-        taken_over = conversation is not None
+        restored = conversation is not None
         if conversation is None:
             self._set_state("connecting", None)
             conversation = self.conversation = self._make_conversation(hooks.session())
         session = conversation.session
         hooks.manager.add(session)
         try:
-            if not taken_over:
+            if not restored:
                 self._link = await hooks.connect(self.address, conversation)
             await conversation.ended
         except LinkError as error:

@@ -36,7 +36,7 @@ from zbridge.protocol.session import Datagram, Session, State
 from zbridge.protocol.session_kept import PARTIAL
 from zbridge.protocol.session_table import SessionTable
 from zbridge.robot.commands import Commands
-from zbridge.robot.connection import Connect, Connection, Hooks, Links, TakeOver
+from zbridge.robot.connection import Attach, Connect, Connection, Hooks, Links
 from zbridge.robot.fleet_latches import FleetLatchNews
 from zbridge.robot.observer import Boundary, LastStop, Nobody, Observer, StopFrame
 from zbridge.robot.on_demand import OnDemand
@@ -45,7 +45,7 @@ from zbridge.robot.presence import Presence
 from zbridge.robot.publishers import RobotPublishers
 from zbridge.robot.queries import PendingQueries, Queries
 from zbridge.robot.telemetry import Telemetry
-from zbridge.transport import Parcel, connect, take_over
+from zbridge.transport import Parcel, Transferable, attach, connect
 from zbridge.transport.fair_share import FairShare
 from zbridge.wire.frames import Partial
 
@@ -67,7 +67,7 @@ _LOOK_S = 0.005
 """Seconds between two looks whether the links can be handed over."""
 
 
-class Device:
+class Device(Transferable):
     """One robot on the bus; ``run`` serves it. addresses: one for each of the robot's links."""
 
     def __init__(
@@ -95,17 +95,17 @@ class Device:
         suspended_s: Callable[[], float] = suspended_s,
         keep_latches: Save = lambda latches: None,
         chance: Callable[[], float] = random.random,
-        take_over: TakeOver = take_over,
+        attach: Attach = attach,
     ) -> None:
         """Begin. share: of the processor, where the process serves other robots too.
 
         shared_address: gateways of other robots may connect to the same addresses. clock: seconds on the event loop's
         time line. clock_ns: Unix time. raw_ms, suspended_s: see :mod:`zbridge.control.context`. keep_latches: writes
-        the latched stops down. chance: 0 to 1. take_over: attaches a connection that another process handed over.
+        the latched stops down. chance: 0 to 1. attach: attaches a connection that another process handed over.
         """
         loop = asyncio.get_running_loop()
         self._protocol = protocol
-        self._released = asyncio.Event()
+        self._detached = asyncio.Event()
         self._crashed = False
         """Whether the robot was taken over from a process that died."""
         self._commanded: list[Handle] = []
@@ -145,9 +145,7 @@ class Device:
         self._presence = Presence(context, protocol, links, self._enforcer, self._standstill, self._commands, pending)
         conditions.changed = self._presence.publish_status
         for name, address in zip(robot.link_names, addresses, strict=True):
-            hooks = msgspec.structs.replace(
-                self._hooks(name, address, connect, manager), take_over=take_over, chance=chance
-            )
+            hooks = msgspec.structs.replace(self._hooks(name, address, connect, manager), attach=attach, chance=chance)
             links.add(Connection(name, f"{keys.robot} {name}", address, hooks))
 
     def _hooks(self, name: str, address: DeviceAddress, connect: Connect, sessions: SessionTable) -> Hooks:
@@ -177,7 +175,7 @@ class Device:
     async def run(self, begin: Callable[[], Awaitable[None]] | None = None) -> None:
         """Serve the robot until cancelled; then stop it if it moves, and take leave of it.
 
-        Returns where :meth:`release` was called. ``begin``: after :meth:`take_over`, waited for once everything is
+        Returns where :meth:`detach` was called. ``begin``: after :meth:`restore`, waited for once everything is
         declared; until then nothing is read or written, and only ``control`` is published, which confirms stops.
         """
         if begin is None:
@@ -186,7 +184,7 @@ class Device:
         if begin is not None:
             await self._context.bus.alive(self._context.keys.alive("gateway"))  # by its answer the bus knows our keys
             await begin()
-            await self.go_on()
+            await self.resume()
             if self._crashed:
                 self._publishers.repeat()
             self._show()
@@ -197,9 +195,9 @@ class Device:
             work = [tasks.create_task(self._beat()), tasks.create_task(self._latch_news.run())]
             work += [tasks.create_task(connection.run()) for connection in self._links]
             try:
-                await self._released.wait()
+                await self._detached.wait()
             finally:  # the links' tasks still run: the group ends them only after this
-                if not self._released.is_set():
+                if not self._detached.is_set():
                     await asyncio.shield(self._shut_down())
                 for task in work:
                     task.cancel()
@@ -210,7 +208,7 @@ class Device:
 
     def _declare(self) -> None:
         bus = self._context.bus
-        bus.on_relief(self._links.resume)
+        bus.on_relief(self._links.resume_reading)
         self._listen()
         self._declared = [bus.watch_connected(self._on_bus)]
 
@@ -326,7 +324,7 @@ class Device:
         self._pending.refuse_all(_ASIDE)
         self._aside = True
         self._standstill.close()
-        self.withdraw()
+        await self.withdraw()
         self._publishers.mute(True)
         await self._stop_written()
         for connection in self._links:
@@ -363,7 +361,7 @@ class Device:
     async def prepare(self, reason: str, within_s: float) -> None:
         """Stop the robot, end the lease and take no commands; wait until the links can be handed over.
 
-        Raises Refused with the reason where that takes longer than ``within_s``; :meth:`go_on` takes it all back.
+        Raises Refused with the reason where that takes longer than ``within_s``; :meth:`resume` takes it all back.
         """
         if not self._context.robot.hands_over:
             raise Unsupported(f"protocol {self._protocol} does not hand its sessions over")
@@ -372,34 +370,27 @@ class Device:
         self._enforcer.stop(reason)
         self._context.pump()
         until = self._context.clock() + within_s
-        while any(connection.stays for connection in self._links):
+        while any(connection.blocker for connection in self._links):
             if self._context.clock() >= until:
-                raise NotReady("; ".join(f"{each.name}: {each.stays}" for each in self._links if each.stays))
+                raise NotReady("; ".join(f"{each.name}: {each.blocker}" for each in self._links if each.blocker))
             await asyncio.sleep(_LOOK_S)
 
-    async def shut(self) -> None:
-        """Do nothing: nobody is accepted here."""
-
-    def hold(self) -> None:
+    def suspend(self) -> None:
         """Read and write nothing from now on."""
         for connection in self._links:
-            connection.hold()
+            connection.suspend()
 
-    def hand_over(self, parcel: Parcel) -> Exported:
-        """Put the links into a parcel; describe them, the robot, and what was published. To be called while held."""
-        return self._describe(parcel)
-
-    def _describe(self, parcel: Parcel, budget: Budget | None = None) -> Exported:
-        links = [connection.hand_over(parcel, budget) for connection in self._links]
+    def export(self, parcel: Parcel, budget: Budget | None = None) -> Exported:
+        """Put the links into a parcel; describe them, the robot, and what was published."""
         return {
-            "links": links,
+            "links": [connection.export(parcel, budget) for connection in self._links],
             "robot": self._context.robot.export(budget),
             "published": self._publishers.export(budget),
             "latches": self._enforcer.authority.latches.export(),
             "aside": self._aside,
         }
 
-    def keep(self, parcel: Parcel, budget: Budget) -> Exported | None:
+    def deposit(self, parcel: Parcel, budget: Budget) -> Exported | None:
         """Describe what another process needs to resume if this one dies; None where it could not.
 
         The incomplete frames are not described: :meth:`partial` tells them after each read.
@@ -410,32 +401,32 @@ class Device:
         talks = (connection.conversation for connection in self._links)
         if any(talk is not None and talk.link is None for talk in talks):  # a link that is not up yet
             return None
-        return {**self._describe(parcel, budget), _CRASHED: True}
+        return {**self.export(parcel, budget), _CRASHED: True}
 
-    def take_over(self, given: Exported, parcel: Parcel, partials: Sequence[Partial] = ()) -> None:
-        """Restore what another process handed over, or deposited; raise ProtocolError.
+    async def restore(self, state: Exported, parcel: Parcel, partials: Sequence[Partial] = ()) -> None:
+        """Restore what another process exported, or deposited; raise ProtocolError.
 
         Call :meth:`run` with ``begin`` then. partials: with a deposit, the incomplete frames of the links that are up.
         """
         self._commands.refuse_all(_TAKING_OVER)
         self._leases.refuse_all(_TAKING_OVER)
-        self._crashed = bool(given.get(_CRASHED))
-        self._aside = self._publishers.muted = given["aside"]
+        self._crashed = bool(state.get(_CRASHED))
+        self._aside = self._publishers.muted = state["aside"]
         for connection in self._links:
             connection.mute(self._aside)
-        self._enforcer.authority.restore_latches(given["latches"])
-        for link, partial_frame in zip(filter(None, given["links"]), partials, strict=False):
+        self._enforcer.authority.restore_latches(state["latches"])
+        for link, partial_frame in zip(filter(None, state["links"]), partials, strict=False):
             link["session"][PARTIAL] = list(partial_frame)
-        for connection, link in zip(self._links, given["links"], strict=True):
-            connection.take_over(link, parcel)
+        for connection, link in zip(self._links, state["links"], strict=True):
+            connection.restore(link, parcel)
         if not self._crashed:
             self._latch_news.inherited()
-        self._publishers.restore(given["published"])  # a new session gives up the names of the one before it
-        if any(given["links"]):
-            self._context.robot.restore(given["robot"])
+        self._publishers.restore(state["published"])  # a new session gives up the names of the one before it
+        if any(state["links"]):
+            self._context.robot.restore(state["robot"])
         session = self._context.robot.driving
         if session is not None and session.state is State.ESTABLISHED:
-            self._presence.resume(session)
+            self._presence.restore(session)
             if self._crashed:  # what waited then may have been written since, and may be motion
                 session.outbox.forget()
                 with contextlib.suppress(Refused):
@@ -445,29 +436,29 @@ class Device:
         """Take over latched stops that were written down, before the robot is served."""
         self._enforcer.restore(latches)
 
-    async def go_on(self) -> None:
+    async def resume(self) -> None:
         """Read, write and take commands: again, or for the first time with what was taken over."""
         self._listen()
         reason = _ASIDE if self._aside else None
         self._commands.refuse_all(reason)
         self._leases.refuse_all(reason)
         for connection in self._links:
-            await connection.go_on()
+            await connection.resume()
 
-    def withdraw(self) -> None:
+    async def withdraw(self) -> None:
         """Take no commands and queries from the bus any more: another process does."""
         handles, self._commanded = self._commanded, []
         for handle in handles:
             handle.close()
 
-    async def release(self) -> None:
+    async def detach(self) -> None:
         """Give the links up and end :meth:`run`; the robot notices nothing."""
-        self._released.set()
+        self._detached.set()
         self._standstill.close()
         self._enforcer.close()
         self._context.conditions.changed = lambda: None
         for connection in self._links:
-            connection.release()
+            connection.detach()
 
     async def _shut_down(self) -> None:
         """Stop a moving robot, take leave of it, say so on the bus, and leave the robot's keys to others."""

@@ -323,7 +323,7 @@ class Ownership:
         yielded = self._state is OwnershipState.YIELDED
         return {"since": self._held_since, "yielded": yielded, "close_until": self._close_until}
 
-    def inherit(self, claim: Exported) -> None:
+    def restore(self, claim: Exported) -> None:
         """Own the robot as the gateway before did, once that goes; called instead of :meth:`take`.
 
         Until :meth:`begin` the claim is a weak one, so that the gateway before may go on if this process fails.
@@ -346,6 +346,13 @@ class Ownership:
     def release(self) -> None:
         """Withdraw the claim; idempotent."""
         self._handle(OwnershipInput.RELEASE)
+
+    async def drain(self) -> None:
+        """Wait until all that was published has left this process: what a successor publishes must not overtake it.
+
+        The successor's claim answers the query that tells.
+        """
+        await self._bus.drain(self._keys.key(CLAIM))
 
     @property
     def yielded(self) -> bool:

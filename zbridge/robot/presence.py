@@ -53,7 +53,7 @@ class Presence:
     def __repr__(self) -> str:
         return f"<Presence {self._context.keys.robot} {self._links.first.state}>"
 
-    def resume(self, session: Session[Any]) -> None:
+    def restore(self, session: Session[Any]) -> None:
         """Take a session for greeted: another process established it."""
         self._greeted, self._busy, self._doubtful = session, session.busy, session.doubtful
 

@@ -101,7 +101,7 @@ class Telemetry:
         if streams and not publishers.muted:
             flowing = self._bus.put_all([(known[path], stream) for path, stream in streams.items()]) and flowing
         if not flowing:
-            self._links.pause()
+            self._links.pause_reading()
 
     def _translator(self, kind: type) -> Translate:
         translate = self._translators[kind] = self._context.robot.translator(kind)

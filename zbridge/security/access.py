@@ -19,7 +19,7 @@ from typing import Any, Literal
 import msgspec
 
 from zbridge.fleet.topics import CMD_STOP, size_bounds
-from zbridge.security.roles import Member, Role, Roles
+from zbridge.security.roles import Member, Roles
 
 STOPS_HZ = 1000.0
 """Stops a second that one member may send to one robot.
@@ -160,18 +160,6 @@ GRANTS: Mapping[Column, tuple[Grant, ...]] = {
     "router": (Grant(Keys.EVERYTHING, tuple(MessageKind)),),
 }
 
-NEEDED: Mapping[str, Role] = {
-    "run, a robot": "gateway",
-    "run, HQ programs only": "hq",
-    "replay": "gateway",
-    "ls, echo, stop, top, foxglove, ros2, console": "viewer",
-    "drive, unlatch, mark; foxglove, ros2 and console that drive": "operator",
-    "drive --takeover, unlatch --all, restart, doctor": "supervisor",
-    "record": "recorder",
-    "router": "router",
-}
-"""Which role each command needs at least."""
-
 
 def column(member: Member) -> Column:
     """Return what the table calls a member."""
@@ -207,7 +195,8 @@ def access_control(roles: Roles, realm: str) -> dict[str, Any]:
     rules = [_rule(_EVERYBODY, "egress", tuple(MessageKind), _widest(realm))]
     obeyed = {roles.common_name(name): [_EVERYBODY] for name in roles.names}
     for (kinds, key_exprs), common_names in users.items():
-        rule_id = f"{_some(common_names)}: {', '.join(kinds)}"
+        more = f" and {len(common_names) - 1} more" if len(common_names) > 1 else ""
+        rule_id = f"{common_names[0]}{more}: {', '.join(kinds)}"  # no two lists of one kind of rule begin with one name
         rules.append(_rule(rule_id, "ingress", kinds, key_exprs))
         for common_name in common_names:
             obeyed[common_name].append(rule_id)
@@ -253,11 +242,6 @@ def downsampling(roles: Roles, realm: str, stops_hz: float = STOPS_HZ) -> list[d
 
 def _widest(realm: str) -> tuple[str, ...]:
     return tuple(expressions(Keys.EVERYTHING, realm, "", ()))
-
-
-def _some(names: list[str]) -> str:
-    """Name a few, and how many more there are; no two different lists of one kind of rule begin with the same name."""
-    return names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
 
 
 def _rule(name: str, flow: str, kinds: Iterable[MessageKind], key_exprs: Iterable[str]) -> dict[str, Any]:

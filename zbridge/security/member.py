@@ -12,6 +12,7 @@ from zbridge.bus import Tls
 from zbridge.bus.tls.certificate import Certificate
 from zbridge.bus.tls.files import is_of_authority, own_certificate, unusable
 from zbridge.errors import ConfigError
+from zbridge.security.files import read_secret
 from zbridge.security.roles import ROLES
 
 
@@ -25,8 +26,6 @@ def check_member(plan: GatewayPlan) -> Certificate | None:
         return None
     if tls.certificate is None or tls.key is None:
         raise ConfigError("bus.tls: expected ca, certificate and key: a secure bus knows everybody by a certificate")
-    from zbridge.security.certs.files import read_secret  # of use on a secure bus alone
-
     certificate = own_certificate(tls)
     read_secret(Path(tls.key))
     if problem := unusable(tls):

@@ -7,7 +7,6 @@ rules for what belongs to op1, must not include what belongs to another name.
 
 from __future__ import annotations
 
-import os
 import re
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -16,7 +15,8 @@ import msgspec
 
 from zbridge.errors import ConfigError
 from zbridge.fleet.topics import is_name
-from zbridge.toml import convert, prefixed, read_toml
+from zbridge.security.files import write
+from zbridge.toml import as_toml, convert, prefixed, read_toml
 
 Role = Literal["viewer", "operator", "supervisor", "gateway", "hq", "recorder", "router"]
 ROLES: tuple[Role, ...] = get_args(Role)
@@ -86,17 +86,9 @@ def load_roles(path: Path) -> Roles:
 
 def save_roles(path: Path, roles: Roles) -> None:
     """Replace ``roles.toml`` as a whole; raise ConfigError if the file cannot be written or the roles are not valid."""
-    text = _HEAD + _revoked(_checked(roles).revoked)
+    text = f"{_HEAD}revoked = {as_toml(_checked(roles).revoked)}\n"
     text += "".join(_table(name, member) for name, member in roles.names.items())
-    new = path.with_name(f".{path.name}.new")
-    try:
-        with new.open("w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        new.replace(path)
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror or error}") from error
+    write(path, text.encode())
 
 
 def check_name(key: str, name: str) -> None:
@@ -139,19 +131,10 @@ def _checked(roles: Roles) -> Roles:
     return roles
 
 
-def _revoked(names: tuple[str, ...]) -> str:
-    return f"revoked = [{', '.join(map(_quoted, names))}]\n"
-
-
 def _table(name: str, member: Member) -> str:
-    robots = f"robots = [{', '.join(map(_quoted, member.robots))}]\n" if member.robots else ""
+    robots = f"robots = {as_toml(member.robots)}\n" if member.robots else ""
     listeners = "listeners = true\n" if member.listeners else ""
     return f'\n[names.{name}]\nrole = "{member.role}"\n{robots}{listeners}'
-
-
-def _quoted(name: str) -> str:
-    """Write a name, which is checked and needs no escape, as a TOML string."""
-    return f'"{name}"'
 
 
 _HEAD = """\

@@ -14,12 +14,13 @@ import time
 from collections.abc import Callable
 
 from zbridge.bus import Bus, IncomingQuery, Neighbour, open_router
-from zbridge.errors import BusError, ConfigError
+from zbridge.errors import BusError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Membership
 from zbridge.metrics import Metrics
 from zbridge.security.router_settings import RouterPlan, zenoh_values
+from zbridge.toml import prefixed
 
 log = logging.getLogger("zbridge.security.router")
 
@@ -42,10 +43,8 @@ class Router:
     async def run(self) -> None:
         """Route until cancelled; raise ConfigError where an address or a TLS file cannot be used."""
         settings = self._plan.settings
-        try:
+        with prefixed(f"no router at {', '.join(settings.listen)}: ", BusError):
             bus = await open_router(zenoh_values(self._plan), Metrics(), self.note)
-        except BusError as error:
-            raise ConfigError(f"no router at {', '.join(settings.listen)}: {error}") from error
         try:
             self._serve(bus)
             log.info("router at %s: %s", ", ".join(settings.listen), self._summary())
@@ -98,11 +97,7 @@ class ZenohWarnings:
         self._logged: dict[str, tuple[float, int]] = {}
         """By warning, when it was logged, and how often it came since."""
 
-    def __repr__(self) -> str:
-        return f"<ZenohWarnings {len(self._logged)}>"
-
     def take(self, line: str) -> None:
-        """Log one line of Zenoh's log."""
         level, text = in_our_words(line)
         if text not in self._logged and len(self._logged) >= KINDS:
             text = "more kinds of Zenoh warnings than are counted apart"
@@ -123,20 +118,14 @@ def in_our_words(line: str) -> tuple[int, str]:
     match = _LINE.match(line)
     if match is None or _LOGGED_ELSEWHERE in line:
         return logging.DEBUG, line
-    return _LEVELS[match["level"]], f"Zenoh: {_TAIL.sub('', match['text'])}"
+    level = logging.getLevelNamesMapping().get(match["level"], logging.DEBUG)  # TRACE is Zenoh's alone
+    return level, f"Zenoh: {_TAIL.sub('', match['text'])}"
 
 
 _LINE = re.compile(r"\S+Z\s+(?P<level>ERROR|WARN|INFO|DEBUG|TRACE) .*?(?P<text>zenoh\S*: .*)")
 _TAIL = re.compile(r"\.? Hint: increase the system open file limit\.|\s+at /\S+\.rs:\d+\.?")
 _LOGGED_ELSEWHERE = "Unable to open listener"
 """Also an error, which ends the process with its text."""
-_LEVELS = {
-    "ERROR": logging.ERROR,
-    "WARN": logging.WARNING,
-    "INFO": logging.INFO,
-    "DEBUG": logging.DEBUG,
-    "TRACE": logging.DEBUG,
-}
 _REFUSED = "refused a connection:"
 _RENEW = "its certificate has expired (zbridge certs renew)"
 _WORDS = (

@@ -182,26 +182,25 @@ def _is_loopback(address: str) -> bool:
 
 def nftables(settings: RouterSettings) -> str:
     """Return rules for ``nft -f``; raise ConfigError if the router listens at no port."""
-    ports = {transport: _ports(settings, transport) for transport in ("tcp", "udp")}
-    rules = [
-        rule
-        for transport, numbers in ports.items()
-        if numbers
-        for family, address in (("4", "ip saddr"), ("6", "ip6 saddr"))
-        for rule in _firewall_rules(
-            f"{transport} dport {{ {', '.join(map(str, numbers))} }}", transport, family, address
-        )
-    ]
-    if not rules:
+    listening = {transport: ports for transport in ("tcp", "udp") if (ports := _ports(settings, transport))}
+    if not listening:
         raise ConfigError(f"listen = {list(settings.listen)}: expected an address with a port")
     sets = [
-        _firewall_set(f"{transport}_{kind}{family}", family, more)
-        for transport, numbers in ports.items()
-        if numbers
+        f"    set {transport}_{kind}{family} {{ type ipv{family}_addr; size 65535; {more} }}"
+        for transport in listening
         for kind, more in (("open", "flags dynamic;"), ("new", "flags dynamic,timeout; timeout 1m;"))
-        for family in ("4", "6")
+        for family in _SOURCE
     ]
-    return _HEAD + _FILE.format(sets="\n".join(sets), rules="\n".join(f"        {rule}" for rule in rules))
+    rules = [
+        f"        {transport} dport {{ {', '.join(map(str, ports))} }} ct state new {rule} counter drop"
+        for transport, ports in listening.items()
+        for family, source in _SOURCE.items()
+        for rule in (
+            f"add @{transport}_open{family} {{ {source} ct count over {AT_A_TIME} }}",
+            f"update @{transport}_new{family} {{ {source} limit rate over {NEW_HZ}/second burst {BURST} packets }}",
+        )
+    ]
+    return _HEAD + _FILE.format(sets="\n".join(sets), rules="\n".join(rules))
 
 
 def _ports(settings: RouterSettings, transport: str) -> list[int]:
@@ -214,19 +213,8 @@ def _ports(settings: RouterSettings, transport: str) -> list[int]:
     return sorted(found)
 
 
-def _firewall_rules(ports: str, transport: str, family: str, address: str) -> tuple[str, str]:
-    new = f"{ports} ct state new"
-    return (
-        f"{new} add @{transport}_open{family} {{ {address} ct count over {AT_A_TIME} }} counter drop",
-        f"{new} update @{transport}_new{family} {{ {address} limit rate over {NEW_HZ}/second burst {BURST} packets }}"
-        " counter drop",
-    )
-
-
-def _firewall_set(name: str, family: str, more: str) -> str:
-    return f"    set {name} {{ type ipv{family}_addr; size 65535; {more} }}"
-
-
+_SOURCE = {"4": "ip saddr", "6": "ip6 saddr"}
+"""By the version of IP, what a rule calls the address that a packet comes from."""
 _HEAD = f"""\
 # Limits the connections that one address may open to a Zenoh router, as `zbridge router --print-nftables` prints it:
 # {AT_A_TIME} at a time, and {NEW_HZ} new ones a second after the first {BURST}. The router's own machine has no limit.

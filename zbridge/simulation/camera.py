@@ -94,9 +94,8 @@ async def _stream(writer: asyncio.StreamWriter) -> None:
     writer.write("\r\n".join((*fields, "", "")).encode())
     for number in count():
         picture = draw(scene(number), COLUMNS)
-        writer.write(b"--FRAME\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % len(picture))
-        writer.write(picture)
-        writer.write(b"\r\n")
+        head = b"--FRAME\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % len(picture)
+        writer.writelines((head, picture, b"\r\n"))
         await writer.drain()
         await asyncio.sleep(EVERY_S)
 

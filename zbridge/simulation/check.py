@@ -12,7 +12,7 @@ import asyncio
 import logging
 import sys
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import msgspec
 
@@ -24,7 +24,7 @@ from zbridge.simulation.check_commands import check_commands, check_stop
 from zbridge.simulation.check_messages import check_messages
 from zbridge.simulation.check_motion import check_motion
 from zbridge.simulation.check_sessions import check_sessions
-from zbridge.simulation.check_stage import CheckFinding, Transcript, record, robot_of
+from zbridge.simulation.check_stage import CheckFinding, Transcript, raised, record, robot_of
 
 USAGE = "usage: python -m zbridge.simulation.check NAME\n"
 ESTABLISH_S = 10.0
@@ -39,9 +39,8 @@ def check(protocol: Protocol, name: str, *, establish_s: float = ESTABLISH_S) ->
     try:
         recording = asyncio.run(record(protocol, establish_s))
     except Exception as error:  # whatever the protocol's own code raises is a finding
-        yield CheckFinding.broken(
-            "the session with the simulated robot is established", error, "a simulated robot that listens"
-        )
+        problem = raised(error, "a simulated robot that listens")
+        yield CheckFinding("the session with the simulated robot is established", problem)
         return
     yield from check_sessions(protocol, recording)
     if not recording.established:
@@ -75,17 +74,10 @@ def main(arguments: list[str]) -> int:
 
 def check_plugin(protocol: Protocol, name: str) -> Iterator[CheckFinding]:
     """Check what the gateway needs before the first connection. name: the entry point's."""
-    checks: tuple[tuple[str, Callable[[], str | None]], ...] = (
-        ("the protocol has the name of its entry point", lambda: _named(protocol, name)),
-        ("the template is a configuration of this protocol", lambda: _template(protocol)),
-        ("a session can be shown", lambda: _shown(protocol)),
-    )
-    for claim, find in checks:
-        yield CheckFinding.tried(claim, find)
-
-
-def _named(protocol: Protocol, name: str) -> str | None:
-    return None if protocol.name == name else f"the entry point is {name!r}, Protocol.name is {protocol.name!r}"
+    other = f"the entry point is {name!r}, Protocol.name is {protocol.name!r}" if protocol.name != name else None
+    yield CheckFinding("the protocol has the name of its entry point", other)
+    yield CheckFinding.tried("the template is a configuration of this protocol", lambda: _template(protocol))
+    yield CheckFinding.tried("a session can be shown", lambda: _shown(protocol))
 
 
 def _template(protocol: Protocol) -> str | None:

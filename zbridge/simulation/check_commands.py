@@ -29,16 +29,15 @@ MORE_FRAMES = 20
 
 def check_stop(protocol: Protocol, recording: Transcript) -> Iterator[CheckFinding]:
     """Check that the stop is the next thing written, and that motion that waits is not sent after it."""
-    expected = "a stop that is put into the outbox"
-    claim = "the stop goes before all that waits, and no motion after it"
-    yield CheckFinding.tried(claim, lambda: _stop(protocol, recording), expected)
-    claim = "a stop is repeated until its time is over"
-    yield CheckFinding.tried(claim, lambda: _repeated(protocol, recording), expected)
-    claim = "a stop before the first connection is refused or ignored"
-    yield CheckFinding.tried(claim, lambda: _early(protocol), "nothing, or Refused")
+    for claim, find, expected in (
+        ("the stop goes before all that waits, and no motion after it", _stop, "a stop that is put into the outbox"),
+        ("a stop is repeated until its time is over", _repeated, "a stop that is put into the outbox"),
+        ("a stop before the first connection is refused or ignored", _early, "nothing, or Refused"),
+    ):
+        yield CheckFinding.tried(claim, partial(find, protocol, recording), expected)
 
 
-def _early(protocol: Protocol) -> None:
+def _early(protocol: Protocol, _: Transcript) -> None:
     with contextlib.suppress(Refused):
         robot_of(protocol).stop(0.0, 0.0)
 
@@ -142,7 +141,7 @@ def _question(protocol: Protocol, recording: Transcript, topic: Topic) -> CheckF
     except Refused as refusal:
         return CheckFinding(claim, None, refusal.code)
     except Exception as error:
-        return CheckFinding.broken(claim, error, "a question to the robot, or Refused")
+        return CheckFinding(claim, raised(error, "a question to the robot, or Refused"))
 
 
 def _carry_out(rehearsal: Rehearsal, topic: Topic, command: FleetMessage) -> str:

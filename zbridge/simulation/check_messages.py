@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import random
 import types
 from collections.abc import Callable, Iterator
@@ -32,28 +33,22 @@ def check_messages(protocol: Protocol) -> Iterator[CheckFinding]:
         frames = _frames(codec, messages, problems)
         yield CheckFinding.of(f"{codec.name}: {len(codec.messages)} messages round-trip", problems)
         yield CheckFinding.of(f"{codec.name}: whole, byte by byte and joined give the same", _cuts(codec, frames))
-        yield CheckFinding.of(
-            f"{codec.name}: what is cut off is a message or a ProtocolError", _truncated(codec, frames)
-        )
+        cut_off = [frame[:size] for frame in frames for size in range(1, len(frame))]
+        yield CheckFinding.of(f"{codec.name}: what is cut off is a message or a ProtocolError", _fed(codec, cut_off))
         yield CheckFinding.of(f"{codec.name}: random bytes are a message or a ProtocolError", _random(codec, frames))
 
 
 def example(declared: type) -> Any:
     """Make an example of a message class: fields without a default get a value of their type."""
-    values = {
-        field.name: _value_of(declared, field)
-        for field in msgspec.structs.fields(declared)
-        if field.required  # the default of another field is its example
-    }
+    values = {}
+    for field in msgspec.structs.fields(declared):
+        try:
+            if field.required:  # the default of another field is its example
+                values[field.name] = _value(field.type)
+        except (KeyError, TypeError) as error:
+            what = f"{declared.__qualname__}.{field.name}: {_name_of(field.type)}"
+            raise LookupError(f"{what}: expected one of {', '.join(map(_name_of, _VALUES))}, or a default") from error
     return declared(**values)
-
-
-def _value_of(declared: type, field: msgspec.structs.FieldInfo) -> Any:
-    try:
-        return _value(field.type)
-    except (KeyError, TypeError) as error:
-        what = f"{declared.__qualname__}.{field.name}: {_name_of(field.type)}"
-        raise LookupError(f"{what}: expected one of {', '.join(map(_name_of, _VALUES))}, or a default") from error
 
 
 def _name_of(hint: Any) -> str:
@@ -136,10 +131,6 @@ def _try(problems: list[str], what: str, cut: Callable[[], list[bytes]], expecte
         problems.append(f"{what} is cut to {found!r}, expected {expected!r}")
 
 
-def _truncated(codec: Codec, frames: list[bytes]) -> list[str]:
-    return _fed(codec, [frame[:size] for frame in frames for size in range(1, len(frame))])
-
-
 def _random(codec: Codec, frames: list[bytes]) -> list[str]:
     """Feed noise, and messages of which one byte was changed."""
     rng = random.Random(1)
@@ -158,7 +149,8 @@ def _fed(codec: Codec, streams: list[bytes]) -> list[str]:
     for stream in streams:
         try:
             for frame in FrameBuffer(codec.frame_end, MOST_BYTES).feed(stream):
-                _read(codec, frame)
+                with contextlib.suppress(ProtocolError, EncodeError):
+                    codec.write(codec.read(frame))
         except FramingFault as fault:
             problems.setdefault(str(fault), f"{stream!r}: {fault}")
         except ProtocolError:
@@ -166,13 +158,6 @@ def _fed(codec: Codec, streams: list[bytes]) -> list[str]:
         except Exception as error:
             problems.setdefault(describe(error), f"{stream!r}: {raised(error, 'a message or ProtocolError')}")
     return list(problems.values())
-
-
-def _read(codec: Codec, frame: bytes) -> None:
-    try:
-        codec.write(codec.read(frame))
-    except (ProtocolError, EncodeError):
-        return
 
 
 _VALUES: dict[Any, Any] = {int: 1, float: 0.5, bool: True, str: "ab", bytes: b"ab"}

@@ -13,7 +13,7 @@ from zbridge.errors import Refused
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, Mode, Motion, Pose
 from zbridge.protocol.plugin import Protocol
-from zbridge.simulation.check_stage import CheckFinding, Stage, live
+from zbridge.simulation.check_stage import CheckFinding, Stage, live, raised
 
 DRIVE_S = 1.0
 AGAIN_S = 0.1
@@ -36,7 +36,7 @@ def check_motion(protocol: Protocol, establish_s: float) -> Iterator[CheckFindin
     try:
         yield from asyncio.run(_drive_and_stop(protocol, establish_s))
     except Exception as error:  # whatever the protocol's own code raises is a finding
-        yield CheckFinding.broken("the simulated robot drives and stands", error)
+        yield CheckFinding("the simulated robot drives and stands", raised(error))
 
 
 async def _drive_and_stop(protocol: Protocol, establish_s: float) -> list[CheckFinding]:

@@ -33,7 +33,8 @@ def check_sessions(protocol: Protocol, recording: Transcript) -> Iterator[CheckF
     try:
         steps = _steps(protocol, recording)
     except Exception as error:
-        yield CheckFinding.broken("what the robot said establishes a session again", error, "the same session again")
+        problem = raised(error, "the same session again")
+        yield CheckFinding("what the robot said establishes a session again", problem)
         return
     tried = f"each step of the handshake ({len(steps)})"
     for claim, go_wrong in (("garbage", _garbage), ("silence", _silence), ("the end of the connection", _lost)):

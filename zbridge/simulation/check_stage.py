@@ -40,19 +40,17 @@ class CheckFinding(msgspec.Struct, frozen=True):
         return cls(claim, "; ".join(problems[:_SHOWN]) + more, note)
 
     @classmethod
-    def broken(cls, claim: str, error: BaseException, expected: str = "") -> CheckFinding:
-        """Make the finding of a claim whose check ended with an exception; ``expected``: what should have come."""
-        return cls(claim, raised(error, expected))
-
-    @classmethod
     def tried(
         cls, claim: str, find: Callable[[], str | list[str] | CheckFinding | None], expected: str = ""
     ) -> CheckFinding:
-        """Make the finding of a check that gives a problem, several, or none, or that ends with an exception."""
+        """Make the finding of a check that gives a problem, several, or none, or that ends with an exception.
+
+        expected: what should have come instead of that.
+        """
         try:
             found = find()
         except Exception as error:  # whatever the protocol's own code raises is a finding
-            return cls.broken(claim, error, expected)
+            return cls(claim, raised(error, expected))
         if isinstance(found, CheckFinding):
             return found
         return cls.of(claim, found) if isinstance(found, list) else cls(claim, found)
@@ -64,7 +62,7 @@ class CheckFinding(msgspec.Struct, frozen=True):
         )
 
 
-def raised(error: BaseException, expected: str) -> str:
+def raised(error: BaseException, expected: str = "") -> str:
     """Say what the protocol's own code raised, in which class and line, and what was expected instead."""
     return f"{describe(error)}; expected {expected}" if expected else describe(error)
 
@@ -155,12 +153,10 @@ class Stage:
                 yield f"{which}: still {session.state.value} after {within_s:g} s; expected Session.establish"
 
     def pump(self) -> None:
-        """Write what may be written."""
         for conversation in self._conversations:
             conversation.pump()
 
     def close(self) -> None:
-        """End the conversations."""
         for conversation in self._conversations:
             conversation.abandon()
 

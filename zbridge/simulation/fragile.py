@@ -13,11 +13,11 @@ import socket
 import sys
 from abc import abstractmethod
 from collections.abc import Callable, Coroutine, Iterable
-from typing import Any, Protocol, Unpack
+from typing import Any
 
 import msgspec
 
-from zbridge.simulation.judge import Bounds, Ended, Judge, MessageReader
+from zbridge.simulation.judge import Ended, Judge, MessageReader
 from zbridge.simulation.sockets import bind_tcp, send_at_once
 
 _UNANSWERED = 16
@@ -35,8 +35,8 @@ class FragilePeer(Judge):
     _phase: enum.Enum
     _reader: MessageReader[Any]
 
-    def __init__(self, **bounds: Unpack[Bounds]) -> None:
-        super().__init__(**bounds)
+    def __init__(self) -> None:
+        super().__init__()
         self.ending = ""
         """Why it ended by itself, "" if it did not."""
         self._over = asyncio.Event()
@@ -81,7 +81,6 @@ class FragilePeer(Judge):
         self._running.append(self._tasks.create_task(work))
 
     def _stop(self) -> None:
-        """End all tasks."""
         for task in self._running:
             task.cancel()
 
@@ -132,16 +131,6 @@ class FragilePeer(Judge):
                 self._conn.shutdown(how)
 
 
-class Simulated(Protocol):
-    """How a simulated robot is started: ``addresses`` to listen at; ``ready`` is called with those that are bound."""
-
-    @property
-    def addresses(self) -> tuple[Any, ...]: ...
-
-    @property
-    def ready(self) -> Callable[[tuple[Any, ...]], None]: ...
-
-
 class FragileServer(FragilePeer):
     """A robot that serves one connection per start; it accepts every later one and never answers it.
 
@@ -158,29 +147,31 @@ class FragileServer(FragilePeer):
         finally:
             self._over.set()
 
-    async def simulate(self, simulation: Simulated, *others: FragileServer) -> None:
-        """Serve the first address of a simulation, ``others`` the next ones, until cancelled, dead or left.
+    async def simulate(
+        self, addresses: tuple[Any, ...], ready: Callable[[tuple[Any, ...]], None], *others: FragileServer
+    ) -> None:
+        """Serve the first address, ``others`` the next ones, until cancelled, dead or left.
 
-        Log each violation, and print why each server ended. Raise OSError for an address that is taken.
+        ``ready`` is called with the addresses that are bound. Log each violation, and print why each server ended.
+        Raise OSError for an address that is taken.
         """
-        addresses = dict(zip((self, *others), simulation.addresses, strict=True))
+        servers = dict(zip((self, *others), addresses, strict=True))
         ports: dict[FragileServer, int] = {}
 
         async def serve(server: FragileServer) -> None:
-            def ready(port: int) -> None:
+            def bound(port: int) -> None:
                 ports[server] = port
-                if len(ports) == len(addresses):
-                    bound = (msgspec.structs.replace(at, port=ports[one]) for one, at in addresses.items())
-                    simulation.ready(tuple(bound))
+                if len(ports) == len(servers):
+                    ready(tuple(msgspec.structs.replace(at, port=ports[one]) for one, at in servers.items()))
 
-            server._note = server._note or log_violations()
-            await server.serve(addresses[server].host, addresses[server].port, ready)
+            server.note = server.note or log_violations()
+            await server.serve(servers[server].host, servers[server].port, bound)
             if server.ending:
                 print_line(server.ending)
 
         try:
             async with asyncio.TaskGroup() as tasks:
-                for server in addresses:
+                for server in servers:
                     tasks.create_task(serve(server))
         except ExceptionGroup as errors:
             raise errors.exceptions[0] from None

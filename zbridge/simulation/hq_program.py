@@ -9,10 +9,9 @@ import asyncio
 import contextlib
 from abc import abstractmethod
 from collections.abc import Iterable
-from typing import ClassVar, Unpack
+from typing import ClassVar
 
 from zbridge.simulation.fragile import FragilePeer, log_violations, print_line
-from zbridge.simulation.judge import Bounds
 from zbridge.simulation.sockets import connected
 
 NEUTRAL_S = 1.0
@@ -35,8 +34,8 @@ class HqProgram(FragilePeer):
     OPTIONS: ClassVar[Iterable[tuple[int, int, int]]] = ()
     """Options of its socket."""
 
-    def __init__(self, **bounds: Unpack[Bounds]) -> None:
-        super().__init__(**bounds)
+    def __init__(self) -> None:
+        super().__init__()
         self.connected = asyncio.Event()
 
     async def run(self, host: str, port: int) -> None:
@@ -50,9 +49,30 @@ class HqProgram(FragilePeer):
             self._over.set()
 
     async def simulate(self, host: str, port: int, drive: tuple[float, float] | None) -> None:
-        """Run as :func:`run_hq_program` does, and log each violation."""
-        self._note = self._note or log_violations()
-        await run_hq_program(self, host, port, drive)
+        """Run until cancelled, dead or left by the robot; print what happens, and log each violation.
+
+        drive: forward and turn that it drives, once it has sent neutral for a while; None: it does not drive. A
+        cancelled program sends neutral before it leaves. Raises OSError if nobody listens.
+        """
+        self.note = self.note or log_violations()
+        print_line(f"connecting to {host}:{port}")
+        running, ready = asyncio.ensure_future(self.run(host, port)), asyncio.Event()
+        beside = [asyncio.ensure_future(self._print(ready))]
+        if drive is not None:
+            beside.append(asyncio.ensure_future(self._drive(ready, *drive)))
+        try:
+            await asyncio.wait((running,))
+        except asyncio.CancelledError:
+            if drive is not None and self.agreed:
+                await self._let_go()
+            raise
+        finally:
+            for task in (running, *beside):
+                task.cancel()
+            await asyncio.gather(running, *beside, return_exceptions=True)
+            if self.death:
+                print_line(f"died: {self.death}")
+        running.result()
 
     async def _read(self) -> None:
         """Read once and judge it, or the end of the connection."""
@@ -80,66 +100,36 @@ class HqProgram(FragilePeer):
     async def push(self, forward: float, turn: float) -> None:
         """Push the stick: fractions of full scale, ``turn`` counter-clockwise."""
 
+    async def _let_go(self) -> None:
+        with contextlib.suppress(OSError, KeyError, TimeoutError):
+            async with asyncio.timeout(LET_GO_S):
+                await self.neutral()
+                print_line("stops driving")
+                await asyncio.sleep(LET_GO_S)
 
-async def run_hq_program(program: HqProgram, host: str, port: int, drive: tuple[float, float] | None) -> None:
-    """Run a program until cancelled, dead or left by the robot; print what happens.
+    async def _drive(self, ready: asyncio.Event, forward: float, turn: float) -> None:
+        """Send neutral for a while, then push the stick."""
+        await ready.wait()
+        with contextlib.suppress(OSError):  # the connection has ended, as is printed
+            print_line("sends neutral")
+            await self.neutral()
+            await asyncio.sleep(NEUTRAL_S)
+            print_line(f"drives: forward {forward:g}, turn {turn:g}")
+            await self.push(forward, turn)
 
-    drive: forward and turn that it drives, once it has sent neutral for a while; None: it does not drive. A cancelled
-    program sends neutral before it leaves. Raises OSError if nobody listens.
-    """
-    print_line(f"connecting to {host}:{port}")
-    running = asyncio.ensure_future(program.run(host, port))
-    ready = asyncio.Event()
-    beside = [asyncio.ensure_future(_print(program, ready))]
-    if drive is not None:
-        beside.append(asyncio.ensure_future(_drive(program, ready, *drive)))
-    try:
-        await asyncio.wait((running,))
-    except asyncio.CancelledError:
-        if drive is not None and program.agreed:
-            await _let_go(program)
-        raise
-    finally:
-        for task in (running, *beside):
-            task.cancel()
-        await asyncio.gather(running, *beside, return_exceptions=True)
-        if program.death:
-            print_line(f"died: {program.death}")
-    running.result()
-
-
-async def _let_go(program: HqProgram) -> None:
-    with contextlib.suppress(OSError, KeyError, TimeoutError):
-        async with asyncio.timeout(LET_GO_S):
-            await program.neutral()
-            print_line("stops driving")
-            await asyncio.sleep(LET_GO_S)
-
-
-async def _drive(program: HqProgram, ready: asyncio.Event, forward: float, turn: float) -> None:
-    """Send neutral for a while, then push the stick."""
-    await ready.wait()
-    with contextlib.suppress(OSError):  # the connection has ended, as is printed
-        print_line("sends neutral")
-        await program.neutral()
-        await asyncio.sleep(NEUTRAL_S)
-        print_line(f"drives: forward {forward:g}, turn {turn:g}")
-        await program.push(forward, turn)
-
-
-async def _print(program: HqProgram, is_ready: asyncio.Event) -> None:
-    """Print what happens when it happens, and what it is shown once a second at most."""
-    loop = asyncio.get_running_loop()
-    agreed, shown, due, printed = "", "", 0.0, 0
-    while True:
-        if program.agreed != agreed:
-            agreed = program.agreed
-            print_line(agreed)
-            is_ready.set()
-        for event in program.events[printed:]:
-            printed += 1
-            print_line(event)
-        if agreed and loop.time() >= due and (now := program.shown()) != shown:
-            shown, due = now, loop.time() + SHOWN_S
-            print_line(f"is shown {shown}")
-        await asyncio.sleep(_LOOK_S)
+    async def _print(self, ready: asyncio.Event) -> None:
+        """Print what happens when it happens, and what it is shown once a second at most."""
+        loop = asyncio.get_running_loop()
+        agreed, shown, due, printed = "", "", 0.0, 0
+        while True:
+            if self.agreed != agreed:
+                agreed = self.agreed
+                print_line(agreed)
+                ready.set()
+            for event in self.events[printed:]:
+                printed += 1
+                print_line(event)
+            if agreed and loop.time() >= due and (now := self.shown()) != shown:
+                shown, due = now, loop.time() + SHOWN_S
+                print_line(f"is shown {shown}")
+            await asyncio.sleep(_LOOK_S)

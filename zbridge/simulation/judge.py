@@ -1,7 +1,9 @@
 """What every judge records: violations, events and the cause of its death. Sans-IO; knows no protocol.
 
-A judge is a simulated peer as fragile as the deployed ones. Judges share their scaffold (this module, ``fragile``,
-``hq_program``, ``sockets`` and ``timing``), and no code with the gateway that they judge.
+A judge is a simulated peer as fragile as the deployed ones: it records each violation of what the page of its protocol
+demands, and dies of what kills or cripples the deployed programs. Section names in its docstrings are those of that
+page. Judges share their scaffold (this module, ``fragile``, ``hq_program``, ``sockets`` and ``timing``), and no code
+with the gateway that they judge, so that an error there cannot hide here: not its messages, session or translation.
 """
 
 from __future__ import annotations
@@ -9,7 +11,7 @@ from __future__ import annotations
 import random
 from collections import deque
 from collections.abc import Callable
-from typing import Any, ClassVar, Generic, NoReturn, TypedDict, TypeVar, Unpack
+from typing import Any, ClassVar, Generic, NoReturn, TypeVar
 
 M = TypeVar("M")
 
@@ -18,24 +20,15 @@ class Ended(Exception):
     """A judge died, or has nothing left to do: raised to end its tasks. Without a text the end is no event."""
 
 
-class Bounds(TypedDict, total=False):
-    """What every judge takes.
-
-    ``keep``: most entries of each list, default its ``KEEP``; ``note``: called with each violation.
-    """
-
-    keep: int
-    note: Callable[[str], None]
-
-
 class Judge:
     """The records of one judge."""
 
     KEEP: ClassVar[int] = 10_000
+    """Most entries of each list."""
 
-    def __init__(self, **bounds: Unpack[Bounds]) -> None:
-        self._keep = bounds.get("keep", self.KEEP)
-        self._note = bounds.get("note")
+    def __init__(self) -> None:
+        self.note: Callable[[str], object] | None = None
+        """Called with each violation."""
         self.violations: list[str] = []
         self.events: list[str] = []
         self.received: deque[Any] = self._rows()
@@ -46,18 +39,18 @@ class Judge:
 
     def _rows(self) -> deque[Any]:
         """Make a list that keeps its newest entries."""
-        return deque(maxlen=self._keep)
+        return deque(maxlen=self.KEEP)
 
     def _violate(self, text: str) -> None:
-        """Record what the protocol page forbids; beyond ``keep`` entries it is only noted."""
-        if len(self.violations) < self._keep:
+        """Record what the protocol page forbids; beyond ``KEEP`` entries it is only noted."""
+        if len(self.violations) < self.KEEP:
             self.violations.append(text)
-        if self._note:
-            self._note(text)
+        if self.note is not None:
+            self.note(text)
 
     def _event(self, text: str) -> None:
-        """Record what happened and is no violation; dropped beyond ``keep`` entries."""
-        if len(self.events) < self._keep:
+        """Record what happened and is no violation; dropped beyond ``KEEP`` entries."""
+        if len(self.events) < self.KEEP:
             self.events.append(text)
 
     def _die(self, text: str) -> NoReturn:

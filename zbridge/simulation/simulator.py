@@ -7,16 +7,18 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, Generic, TypeVar
 
 from zbridge.errors import EncodeError, Refused
 from zbridge.protocol.plugin import Simulation
 from zbridge.protocol.session import Session, State
 from zbridge.simulation.timing import Ticker
-from zbridge.transport import Accepted, Conversation, Link, Receiver, listen
+from zbridge.transport import Accepted, Conversation, Link, listen
 
 STEP_S = 0.02
 """Seconds between two steps of a simulated robot, in its own time too."""
@@ -24,6 +26,14 @@ CATCH_UP_S = 1.0
 """Most seconds of its life that a robot makes up for after this process was late."""
 
 M = TypeVar("M")
+
+
+async def live(step: Callable[[int], None]) -> None:
+    """Call ``step`` every :data:`STEP_S` with its number, from 1, until cancelled."""
+    ticker = Ticker(STEP_S, catch_up_s=CATCH_UP_S)
+    for steps in itertools.count(1):
+        await ticker.tick()
+        step(steps)
 
 
 class Simulator(ABC, Generic[M]):
@@ -91,25 +101,17 @@ class Simulator(ABC, Generic[M]):
         """Listen on each address and live until cancelled; then close every conversation."""
         async with contextlib.AsyncExitStack() as stack:
             addresses = [
-                await stack.enter_async_context(listen(address, self._accepting(name), datagrams=self._datagrams))
+                await stack.enter_async_context(
+                    listen(address, partial(Accepted, partial(self._admit, name=name)), datagrams=self._datagrams)
+                )
                 for name, address in zip(self._links, simulation.addresses, strict=True)
             ]
             simulation.ready(tuple(addresses))
             try:
-                await self._live()
+                await live(self.step)
             finally:
                 for client in tuple(self._clients):
                     client.close("simulator ended")
-
-    async def _live(self) -> None:
-        ticker, steps = Ticker(STEP_S, catch_up_s=CATCH_UP_S), 0
-        while True:
-            await ticker.tick()
-            steps += 1
-            self.step(steps)
-
-    def _accepting(self, name: str) -> Callable[[], Receiver]:
-        return lambda: Accepted(lambda link: self._admit(link, name))
 
     def _admit(self, link: Link, name: str) -> Conversation | None:
         session = self.session(link.peer, name)

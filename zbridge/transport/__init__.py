@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from zbridge.transport.accepted import Accepted
-from zbridge.transport.by_address import connect, take_over
+from zbridge.transport.by_address import attach, connect
 from zbridge.transport.conversation import Conversation
 from zbridge.transport.door import Door
 from zbridge.transport.link import Link, Receiver
-from zbridge.transport.parcel import Parcel
 from zbridge.transport.tcp import TcpLink, listen
 from zbridge.transport.tls import TlsLink, server_context
+from zbridge.transport.transferable import Parcel, Transferable
 
 __all__ = [
     "Accepted",
@@ -20,8 +20,9 @@ __all__ = [
     "Receiver",
     "TcpLink",
     "TlsLink",
+    "Transferable",
+    "attach",
     "connect",
     "listen",
     "server_context",
-    "take_over",
 ]

@@ -8,7 +8,7 @@ from zbridge.protocol.kept import Exported
 from zbridge.transport import serial, tcp
 from zbridge.transport.kernel import KERNEL, Kernel
 from zbridge.transport.link import Link, Receiver
-from zbridge.transport.parcel import Parcel
+from zbridge.transport.transferable import Parcel
 
 
 async def connect(
@@ -27,15 +27,15 @@ async def connect(
     return await tcp.connect(address, receiver, buffer, kernel)
 
 
-async def take_over(
-    address: DeviceAddress, given: Exported, parcel: Parcel, receiver: Receiver, kernel: Kernel = KERNEL
+async def attach(
+    address: DeviceAddress, state: Exported, parcel: Parcel, receiver: Receiver, kernel: Kernel = KERNEL
 ) -> Link:
     """Attach ``receiver`` to the connection that another process handed over; raise ProtocolError, OSError.
 
     Only when the other process has let go: reading begins at once.
     """
     if isinstance(address, SerialAddress):
-        return serial.take_over(address, parcel.take(given.get("serial")), receiver)
+        return serial.attach(address, parcel.take(state.get("serial")), receiver)
     if isinstance(address, ZenohAddress):
         raise ProtocolError("a Zenoh session stays in its process")
-    return await tcp.take_over(given, parcel, receiver, kernel)
+    return await tcp.attach(state, parcel, receiver, kernel)

@@ -24,9 +24,9 @@ from zbridge.protocol.kept import Budget, Exported
 from zbridge.protocol.session import Datagram, Session, State
 from zbridge.transport.fair_share import FairShare
 from zbridge.transport.link import Link
-from zbridge.transport.parcel import Parcel
 from zbridge.transport.reading import Reading
 from zbridge.transport.stalls import Stalls
+from zbridge.transport.transferable import Parcel
 
 log = logging.getLogger("zbridge.link")
 
@@ -131,8 +131,8 @@ class Conversation:
         if self.connected_at is None:
             self.connected_at = self._heard_at
         self._linked(link, True)
-        if self._reading.held:
-            link.hold()
+        if self._reading.suspended:
+            link.suspend()
         self.session.peer = link.peer
         self.session.open(self._clock())
 
@@ -218,7 +218,7 @@ class Conversation:
         self.pump()
 
     def _pump(self) -> None:
-        if self._reading.held:
+        if self._reading.suspended:
             return
         session, link = self.session, self._link
         outbox = session.outbox
@@ -285,24 +285,24 @@ class Conversation:
         self.session.lost("abandoned")
         self._end()
 
-    def pause(self) -> None:
-        """Read nothing until :meth:`resume`."""
+    def pause_reading(self) -> None:
+        """Read nothing until :meth:`resume_reading`."""
         self._reading.pause()
 
-    def resume(self) -> None:
+    def resume_reading(self) -> None:
         """Read again."""
         self._reading.resume()
 
     # A restart
 
     @property
-    def held(self) -> bool:
+    def suspended(self) -> bool:
         """Whether nothing is read or written, and no timer runs: another process has the connection, or may get it."""
-        return self._reading.held
+        return self._reading.suspended
 
-    @held.setter
-    def held(self, held: bool) -> None:
-        self._reading.held = held
+    @suspended.setter
+    def suspended(self, suspended: bool) -> None:
+        self._reading.suspended = suspended
 
     @property
     def link(self) -> Link | None:
@@ -310,47 +310,47 @@ class Conversation:
         return self._link
 
     @property
-    def stays(self) -> str | None:
+    def blocker(self) -> str | None:
         """Why the conversation cannot be handed to another process now; None where it can."""
         link = self._link
         if link is None or self.session.over:
             return "the connection is not up"
-        return link.stays or (None if link.ready else "the peer takes nothing")
+        return link.blocker or (None if link.ready else "the peer takes nothing")
 
-    def hold(self) -> None:
-        """Read and write nothing, and run no timer, until :meth:`go_on`."""
-        self.held = True
+    def suspend(self) -> None:
+        """Read and write nothing, and run no timer, until :meth:`resume`."""
+        self.suspended = True
         self._set_timer(None)
         if self._link is not None:
-            self._link.hold()
+            self._link.suspend()
 
-    def go_on(self) -> None:
-        """Go on where :meth:`hold` interrupted: this process has the connection."""
-        self.held = False
+    def resume(self) -> None:
+        """Go on where :meth:`suspend` interrupted: this process has the connection."""
+        self.suspended = False
         if self._link is not None:
-            self._link.go_on()
+            self._link.resume()
         self.pump()
 
-    def hand_over(self, parcel: Parcel, budget: Budget | None = None) -> Exported:
-        """Put the connection of a held conversation into a parcel; describe it and the session.
+    def export(self, parcel: Parcel, budget: Budget | None = None) -> Exported:
+        """Put the connection of a suspended conversation into a parcel; describe it and the session.
 
-        budget: of a deposit; the conversation need not be held then.
+        budget: of a deposit; the conversation need not be suspended then.
         """
         assert self._link is not None
         return {
             "session": self.session.export(budget),
-            "link": self._link.hand_over(parcel),
+            "link": self._link.export(parcel),
             "connected_at": self.connected_at,
         }
 
-    def release(self) -> None:
+    def detach(self) -> None:
         """Forget the connection, which another process has now: the peer notices nothing."""
-        self.held = True
+        self.suspended = True
         self._set_timer(None)
         self._reading.end()
         link, self._link = self._link, None
         if link is not None:
-            link.release()
+            link.detach()
 
     @_then_pump
     def _tick(self) -> None:

@@ -16,7 +16,7 @@ from zbridge.protocol.address import Address
 from zbridge.protocol.kept import Exported
 from zbridge.transport.kernel import KERNEL, Kernel
 from zbridge.transport.link import Link, Receiver
-from zbridge.transport.parcel import Parcel
+from zbridge.transport.transferable import Parcel
 from zbridge.transport.udp import DatagramHub
 
 Accept = Callable[[Receiver], asyncio.BufferedProtocol]
@@ -25,11 +25,11 @@ L = TypeVar("L", bound=asyncio.BaseProtocol)
 
 
 class Door:
-    """The sockets of one listener. ``given``, ``parcel``: as another process handed them over; it begins shut then."""
+    """The sockets of one listener. ``state``, ``parcel``: as another process exported them; it begins shut then."""
 
-    def __init__(self, given: Exported | None = None, parcel: Parcel | None = None, kernel: Kernel = KERNEL) -> None:
+    def __init__(self, state: Exported | None = None, parcel: Parcel | None = None, kernel: Kernel = KERNEL) -> None:
         self.kernel = kernel
-        self._given = given
+        self._state = state
         self._parcel = parcel or Parcel()
         self._sockets: list[socket.socket] = []
         self._servers: list[asyncio.Server] = []
@@ -45,24 +45,24 @@ class Door:
     ) -> Address:
         """Bind the address and open, or take the sockets over; return the address with its port. Raise OSError."""
         self._receiver, self._accept, self._hub = receiver, accept, hub
-        if self._given is not None:
-            self._take_over(self._given)
+        if self._state is not None:
+            self._restore(self._state)
         else:
             loop = asyncio.get_running_loop()
             server = await loop.create_server(lambda: accept(receiver()), address.host, address.port)
             self._servers = [server]
             self._sockets = [self.kernel.adopt(self.kernel.duplicate(bound.fileno())) for bound in server.sockets]
         host, port = self._sockets[0].getsockname()[:2]
-        if hub is not None and self._given is None:
+        if hub is not None and self._state is None:
             hub.open(host, port)
         return Address(host, port, address.tls)
 
-    def _take_over(self, given: Exported) -> None:
-        self._sockets = [self.kernel.adopt(self._parcel.take(number)) for number in given["tcp"]]
-        if not self._sockets or (given["udp"] is None) is not (self._hub is None):
+    def _restore(self, state: Exported) -> None:
+        self._sockets = [self.kernel.adopt(self._parcel.take(number)) for number in state["tcp"]]
+        if not self._sockets or (state["udp"] is None) is not (self._hub is None):
             raise ProtocolError("other sockets than this listener's")
         if self._hub is not None:
-            self._hub.take_over(self.kernel.adopt(self._parcel.take(given["udp"])))
+            self._hub.restore(self.kernel.adopt(self._parcel.take(state["udp"])))
 
     async def open(self) -> None:
         """Accept peers, again or for the first time; take their datagrams."""
@@ -72,7 +72,7 @@ class Door:
             copy.setblocking(False)
             self._servers.append(await loop.create_server(lambda: self._accept(self._receiver()), sock=copy))
         if self._hub is not None:
-            self._hub.go_on()
+            self._hub.resume()
 
     def shut(self) -> None:
         """Accept nobody until :meth:`open`. Who was accepted in this turn of the loop is attached in the next two."""
@@ -80,12 +80,12 @@ class Door:
         for server in servers:
             server.close()
 
-    def hold(self) -> None:
+    def suspend(self) -> None:
         """Take no datagrams until :meth:`open`."""
         if self._hub is not None:
-            self._hub.hold()
+            self._hub.suspend()
 
-    def hand_over(self, parcel: Parcel) -> Exported:
+    def export(self, parcel: Parcel) -> Exported:
         """Put the sockets into a parcel; describe them for the process that gets it."""
         udp = parcel.put(self._hub.fileno()) if self._hub is not None else None
         return {"tcp": [parcel.put(bound.fileno()) for bound in self._sockets], "udp": udp}
@@ -98,7 +98,7 @@ class Door:
         """Attach an accepted peer that was handed over, with the source of its datagrams."""
         connection = self.kernel.adopt(self._parcel.take(number))
         connection.setblocking(False)
-        link = await attach(connection, lambda: self._accept(receiver))
+        link = await make_link(connection, lambda: self._accept(receiver))
         if source is not None and self._hub is not None:
             self._hub.bind(link, receiver, source)  # type: ignore[arg-type]
 
@@ -111,7 +111,7 @@ class Door:
             bound.close()
 
 
-async def attach(sock: socket.socket, make: Callable[[], L]) -> L:
+async def make_link(sock: socket.socket, make: Callable[[], L]) -> L:
     """Make a link of a connected socket, whose descriptor belongs to the link from now on; raise OSError.
 
     Where the peer has already gone, uvloop closes the descriptor before it knows the socket object. That object must

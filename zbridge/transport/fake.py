@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from zbridge.protocol.kept import Exported
-from zbridge.transport.parcel import Parcel
+from zbridge.transport.transferable import Parcel
 
 
 class FakeLink:
@@ -22,7 +22,7 @@ class FakeLink:
         self.datagrams: list[bytes] = []
         self.sources_dropped = 0
         self.paused = False
-        self.held = False
+        self.suspended = False
         self.closed = False
 
     def write(self, data: bytes) -> None:
@@ -37,29 +37,29 @@ class FakeLink:
         """Note the call."""
         self.sources_dropped += 1
 
-    def pause(self) -> None:
+    def pause_reading(self) -> None:
         """Note the call."""
         self.paused = True
 
-    def resume(self) -> None:
+    def resume_reading(self) -> None:
         """Note the call."""
         self.paused = False
 
-    stays: str | None = None
+    blocker: str | None = None
 
-    def hold(self) -> None:
+    def suspend(self) -> None:
         """Note the call."""
-        self.held = True
+        self.suspended = True
 
-    def go_on(self) -> None:
+    def resume(self) -> None:
         """Note the call."""
-        self.held = False
+        self.suspended = False
 
-    def hand_over(self, parcel: Parcel) -> Exported:
+    def export(self, parcel: Parcel) -> Exported:
         """Have nothing to hand over."""
         return {}
 
-    def release(self) -> None:
+    def detach(self) -> None:
         """Note the call."""
         self.closed = True
 

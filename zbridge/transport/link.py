@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from zbridge.protocol.kept import Exported
-from zbridge.transport.parcel import Parcel
+from zbridge.transport.transferable import Parcel
 
 STALLED_S = 0.3
 """Seconds without acknowledgement after which a robot's link is stalled; healthy robots acknowledge within 50 ms."""
@@ -84,26 +84,26 @@ class Link(Protocol):
         the platform does not tell.
         """
 
-    def pause(self) -> None:
-        """Read nothing until :meth:`resume`."""
+    def pause_reading(self) -> None:
+        """Read nothing until :meth:`resume_reading`."""
 
-    def resume(self) -> None:
+    def resume_reading(self) -> None:
         """Read again."""
 
     @property
-    def stays(self) -> str | None:
+    def blocker(self) -> str | None:
         """Why this connection cannot be handed to another process; None where it can."""
 
-    def hold(self) -> None:
-        """Read nothing, neither stream nor datagrams, until :meth:`go_on`: another process may do so meanwhile."""
+    def suspend(self) -> None:
+        """Read nothing, neither stream nor datagrams, until :meth:`resume`: another process may do so meanwhile."""
 
-    def go_on(self) -> None:
-        """Read again, after :meth:`hold`."""
+    def resume(self) -> None:
+        """Read again, after :meth:`suspend`."""
 
-    def hand_over(self, parcel: Parcel) -> Exported:
-        """Put what the connection consists of into a parcel, and describe it; the link must be held and ``ready``."""
+    def export(self, parcel: Parcel) -> Exported:
+        """Put what the connection consists of into a parcel; describe it. The link must be suspended and ``ready``."""
 
-    def release(self) -> None:
+    def detach(self) -> None:
         """Give up a connection that another process has now: neither the peer nor the receiver notices."""
 
     def close(self) -> None:

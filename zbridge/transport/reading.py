@@ -19,7 +19,7 @@ class Reading:
         self, loop: asyncio.AbstractEventLoop, clock: Callable[[], float], share: FairShare | None = None
     ) -> None:
         self.link: Link | None = None
-        self.held = False
+        self.suspended = False
         """Whether another process has the connection, or may get it: then it is not read, whatever else is said."""
         self._loop = loop
         self._clock = clock
@@ -39,7 +39,7 @@ class Reading:
         """Read nothing until :meth:`resume`."""
         self._paused = True
         if self.link is not None:
-            self.link.pause()
+            self.link.pause_reading()
 
     def resume(self) -> None:
         """Read again."""
@@ -53,7 +53,7 @@ class Reading:
         now = self._clock()
         rest_s = self._share.spent(now - begun, now)
         if rest_s and self._rests is None and self.link is not None:
-            self.link.pause()
+            self.link.pause_reading()
             self._rests = self._loop.call_later(rest_s, self._rested)
 
     def end(self) -> None:
@@ -69,5 +69,5 @@ class Reading:
             self._go_on()
 
     def _go_on(self) -> None:
-        if self.link is not None and self._rests is None and not self.held:
-            self.link.resume()
+        if self.link is not None and self._rests is None and not self.suspended:
+            self.link.resume_reading()

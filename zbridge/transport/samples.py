@@ -23,7 +23,7 @@ from zbridge.protocol.kept import Exported
 from zbridge.protocol.rate_limit import RateLimit
 from zbridge.protocol.samples import KeyedSample, SampleKind, dropped, read_sample, write_sample
 from zbridge.transport.link import Receiver
-from zbridge.transport.parcel import Parcel
+from zbridge.transport.transferable import Parcel
 
 RATE_HZ = 2000.0
 """Samples a second of one subscription; more are dropped on Zenoh's own thread."""
@@ -95,11 +95,11 @@ class ZenohLink:
     def drop_source(self) -> None:
         """Do nothing: there is no source of datagrams."""
 
-    def pause(self) -> None:
-        """Drop and count what comes, until :meth:`resume`: Zenoh cannot be told to wait."""
+    def pause_reading(self) -> None:
+        """Drop and count what comes, until :meth:`resume_reading`: Zenoh cannot be told to wait."""
         self._paused = True
 
-    def resume(self) -> None:
+    def resume_reading(self) -> None:
         """Read again."""
         self._paused = False
 
@@ -109,23 +109,23 @@ class ZenohLink:
         return ()
 
     @property
-    def stays(self) -> str | None:
+    def blocker(self) -> str | None:
         """Why this link cannot be handed to another process."""
         return "a Zenoh session stays in its process"
 
-    def hold(self) -> None:
-        """Drop and count what comes, until :meth:`go_on`."""
-        self.pause()
+    def suspend(self) -> None:
+        """Drop and count what comes, until :meth:`resume`."""
+        self.pause_reading()
 
-    def go_on(self) -> None:
-        """Read again, after :meth:`hold`."""
-        self.resume()
+    def resume(self) -> None:
+        """Read again, after :meth:`suspend`."""
+        self.resume_reading()
 
-    def hand_over(self, parcel: Parcel) -> Exported:
-        """Raise NotReady: see :attr:`stays`."""
-        raise NotReady(str(self.stays))
+    def export(self, parcel: Parcel) -> Exported:
+        """Raise NotReady: see :attr:`blocker`."""
+        raise NotReady(str(self.blocker))
 
-    def release(self) -> None:
+    def detach(self) -> None:
         """Close the session: no other process can have it."""
         self.close()
 

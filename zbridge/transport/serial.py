@@ -22,7 +22,7 @@ from zbridge.protocol.address import SerialAddress
 from zbridge.protocol.kept import Exported
 from zbridge.transport.backlog import Backlog
 from zbridge.transport.link import STALLED_S, Receiver
-from zbridge.transport.parcel import Parcel
+from zbridge.transport.transferable import Parcel
 
 READ_BYTES = 4096
 """Most bytes taken from a line before the loop serves others; the kernel's buffer of a terminal holds no more."""
@@ -52,7 +52,7 @@ class SerialLink:
         self._unwritten = b""
         self._open = True
         self._reading = False
-        self._held = False
+        self._suspended = False
         self._close_by: float | None = None
 
     def __repr__(self) -> str:
@@ -60,7 +60,7 @@ class SerialLink:
 
     def begin(self) -> None:
         """Attach the receiver and begin to read; called once."""
-        self.resume()
+        self.resume_reading()
         self._receiver.attached(self)
 
     @property
@@ -107,40 +107,40 @@ class SerialLink:
             backlog.settle(self._unsent())
         return backlog.waited_s(now)
 
-    def pause(self) -> None:
-        """Read nothing until :meth:`resume`."""
+    def pause_reading(self) -> None:
+        """Read nothing until :meth:`resume_reading`."""
         if self._reading:
             self._reading = False
             self._loop.remove_reader(self._fd)
 
-    def resume(self) -> None:
+    def resume_reading(self) -> None:
         """Read again."""
-        if self._open and self._close_by is None and not self._reading and not self._held:
+        if self._open and self._close_by is None and not self._reading and not self._suspended:
             self._reading = True
             self._loop.add_reader(self._fd, self._read)
 
     @property
-    def stays(self) -> str | None:
+    def blocker(self) -> str | None:
         """None: a line can be handed over."""
         return None
 
-    def hold(self) -> None:
-        """Read nothing until :meth:`go_on`."""
-        self._held = True
-        self.pause()
+    def suspend(self) -> None:
+        """Read nothing until :meth:`resume`."""
+        self._suspended = True
+        self.pause_reading()
 
-    def go_on(self) -> None:
+    def resume(self) -> None:
         """Read again."""
-        self._held = False
-        self.resume()
+        self._suspended = False
+        self.resume_reading()
 
-    def hand_over(self, parcel: Parcel) -> Exported:
+    def export(self, parcel: Parcel) -> Exported:
         """Put the line into a parcel: its lock goes with the descriptor, and what the driver has is still sent."""
         return {"serial": parcel.put(self._fd)}
 
-    def release(self) -> None:
+    def detach(self) -> None:
         """Give up the own end of a line that another process has now."""
-        self.pause()
+        self.pause_reading()
         self._open = False
         with contextlib.suppress(OSError):
             self._port.close()
@@ -148,7 +148,7 @@ class SerialLink:
     def close(self) -> None:
         """Close the line after what was written, within :data:`CLOSE_S`; idempotent."""
         if self._open and self._close_by is None:
-            self.pause()
+            self.pause_reading()
             self._close_by = self._loop.time() + CLOSE_S
             self._close_when_sent()
 
@@ -210,7 +210,7 @@ class SerialLink:
         """Close the line and tell the receiver, later: the caller may be in the middle of a write."""
         if not self._open:
             return
-        self.pause()
+        self.pause_reading()
         if self._unwritten:
             self._loop.remove_writer(self._fd)
         if self._unsent():  # else the kernel waits in close for bytes that nobody takes
@@ -232,7 +232,7 @@ def connect(address: SerialAddress, receiver: Receiver) -> SerialLink:
     return link
 
 
-def take_over(address: SerialAddress, descriptor: int, receiver: Receiver) -> SerialLink:
+def attach(address: SerialAddress, descriptor: int, receiver: Receiver) -> SerialLink:
     """Use a line that another process opened and configured."""
     link = SerialLink(address, _Line(descriptor), receiver)
     link.begin()

@@ -19,11 +19,11 @@ from zbridge.metrics import Count
 from zbridge.protocol.address import Address
 from zbridge.protocol.kept import Exported
 from zbridge.transport.backlog import Backlog
-from zbridge.transport.door import Door, attach
+from zbridge.transport.door import Door, make_link
 from zbridge.transport.kernel import KERNEL, Kernel
 from zbridge.transport.link import NOBODY, STALLED_S, Receiver
-from zbridge.transport.parcel import Parcel
 from zbridge.transport.tcp_options import KEEPALIVE_S, bound_retries, keep_alive, new_backlog, outstanding, tune
+from zbridge.transport.transferable import Parcel
 from zbridge.transport.udp import DatagramHub, DatagramSocket
 
 log = logging.getLogger("zbridge.link")
@@ -56,7 +56,7 @@ class TcpLink(asyncio.BufferedProtocol):
     """A TCP connection. ``hub``: the listener's UDP socket, if the peer was accepted there.
 
     ``buffer``: where reads go, :data:`READ_BYTES` of its own by default. Reads are copied at once, so all links of a
-    loop may share it. ``accepted``: by a listener. ``given_udp``: the socket for datagrams to a robot, where another
+    loop may share it. ``accepted``: by a listener. ``restored_udp``: the socket for datagrams to a robot, where another
     process handed the connection over.
     """
 
@@ -67,13 +67,13 @@ class TcpLink(asyncio.BufferedProtocol):
         buffer: bytearray | None = None,
         *,
         accepted: bool = False,
-        given_udp: socket.socket | None = None,
+        restored_udp: socket.socket | None = None,
         kernel: Kernel = KERNEL,
     ) -> None:
         self._kernel = kernel
         self.peer = ""
         self.reads: Callable[[], object] = _unwatched
-        self._given_udp = given_udp
+        self._restored_udp = restored_udp
         self._backlog: Backlog | None = None
         self._hub = hub
         self._accepted = accepted
@@ -153,41 +153,41 @@ class TcpLink(asyncio.BufferedProtocol):
             backlog.settle(outstanding(transport, self._kernel))
         return backlog.waited_s(now)
 
-    def pause(self) -> None:
-        """Read nothing until :meth:`resume`."""
+    def pause_reading(self) -> None:
+        """Read nothing until :meth:`resume_reading`."""
         if self._transport is not None and self._transport.is_reading():
             self._transport.pause_reading()
 
-    def resume(self) -> None:
+    def resume_reading(self) -> None:
         """Read again."""
         if self._transport is not None and not self._transport.is_reading():
             self._transport.resume_reading()
 
     @property
-    def stays(self) -> str | None:
+    def blocker(self) -> str | None:
         """Why this connection cannot be handed over: a tls connection has keys that no other process knows."""
         tls = self._transport is not None and self._transport.get_extra_info("ssl_object") is not None
         return "a tls connection cannot be handed over" if tls else None
 
-    def hold(self) -> None:
-        """Read nothing, neither stream nor datagrams of our own socket, until :meth:`go_on`."""
-        self.pause()
+    def suspend(self) -> None:
+        """Read nothing, neither stream nor datagrams of our own socket, until :meth:`resume`."""
+        self.pause_reading()
         if self._datagrams is not None:
-            self._datagrams.hold()
+            self._datagrams.suspend()
 
-    def go_on(self) -> None:
-        """Read again, after :meth:`hold`."""
-        self.resume()
+    def resume(self) -> None:
+        """Read again, after :meth:`suspend`."""
+        self.resume_reading()
         if self._datagrams is not None:
-            self._datagrams.go_on()
+            self._datagrams.resume()
 
-    def hand_over(self, parcel: Parcel) -> Exported:
+    def export(self, parcel: Parcel) -> Exported:
         """Put the sockets into a parcel. What the kernel has is sent by the kernel."""
         assert self._transport is not None
         udp = parcel.put(self._datagrams.fileno()) if self._datagrams is not None else None
         return {"tcp": parcel.put(self._transport.get_extra_info("socket").fileno()), "udp": udp}
 
-    def release(self) -> None:
+    def detach(self) -> None:
         """Give up the own descriptors of a connection that another process has now: no FIN is sent."""
         self._receiver = NOBODY
         self.abort()
@@ -226,9 +226,9 @@ class TcpLink(asyncio.BufferedProtocol):
         else:
             bound_retries(sock)
             self._backlog = new_backlog(sock, self._kernel)
-            if self._given_udp is not None:
-                self._datagrams = DatagramSocket(self._transport, self._receiver, self._given_udp, self._kernel)
-                self._datagrams.go_on()
+            if self._restored_udp is not None:
+                self._datagrams = DatagramSocket(self._transport, self._receiver, self._restored_udp, self._kernel)
+                self._datagrams.resume()
         if self._hub is not None:
             self._hub.add(self, peer[0], self._receiver)
         self._receiver.attached(self)
@@ -288,12 +288,12 @@ async def connect(
     return link
 
 
-async def take_over(given: Exported, parcel: Parcel, receiver: Receiver, kernel: Kernel = KERNEL) -> TcpLink:
+async def attach(state: Exported, parcel: Parcel, receiver: Receiver, kernel: Kernel = KERNEL) -> TcpLink:
     """Attach ``receiver`` to the connection that another process handed over; raise ProtocolError, OSError."""
-    sock = kernel.adopt(parcel.take(given.get("tcp")))
+    sock = kernel.adopt(parcel.take(state.get("tcp")))
     sock.setblocking(False)
-    udp = kernel.adopt(parcel.take(given["udp"])) if given.get("udp") is not None else None
-    return await attach(sock, lambda: TcpLink(receiver, given_udp=udp, kernel=kernel))
+    udp = kernel.adopt(parcel.take(state["udp"])) if state.get("udp") is not None else None
+    return await make_link(sock, lambda: TcpLink(receiver, restored_udp=udp, kernel=kernel))
 
 
 @contextlib.asynccontextmanager

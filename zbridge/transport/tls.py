@@ -16,7 +16,7 @@ from collections.abc import Callable
 from zbridge.errors import LinkError, NotReady
 from zbridge.protocol.kept import Exported
 from zbridge.transport.link import Link, Receiver
-from zbridge.transport.parcel import Parcel
+from zbridge.transport.transferable import Parcel
 
 _READ_BYTES = 16_384
 """The most that one record of TLS holds."""
@@ -94,15 +94,15 @@ class TlsLink(Receiver):
     def drop_source(self) -> None:
         """Do nothing: there are no datagrams."""
 
-    def pause(self) -> None:
-        """Read nothing until :meth:`resume`."""
+    def pause_reading(self) -> None:
+        """Read nothing until :meth:`resume_reading`."""
         if self._link is not None:
-            self._link.pause()
+            self._link.pause_reading()
 
-    def resume(self) -> None:
+    def resume_reading(self) -> None:
         """Read again."""
         if self._link is not None:
-            self._link.resume()
+            self._link.resume_reading()
 
     @property
     def descriptors(self) -> tuple[int, ...]:
@@ -110,25 +110,25 @@ class TlsLink(Receiver):
         return self._link.descriptors if self._link is not None else ()
 
     @property
-    def stays(self) -> str | None:
+    def blocker(self) -> str | None:
         """Why this connection cannot be handed to another process: the keys of TLS stay in this one."""
         return "encrypted by this process"
 
-    def hold(self) -> None:
-        """Read nothing until :meth:`go_on`."""
+    def suspend(self) -> None:
+        """Read nothing until :meth:`resume`."""
         if self._link is not None:
-            self._link.hold()
+            self._link.suspend()
 
-    def go_on(self) -> None:
-        """Read again, after :meth:`hold`."""
+    def resume(self) -> None:
+        """Read again, after :meth:`suspend`."""
         if self._link is not None:
-            self._link.go_on()
+            self._link.resume()
 
-    def hand_over(self, parcel: Parcel) -> Exported:
-        """Raise NotReady: see :attr:`stays`."""
-        raise NotReady(f"the connection is {self.stays}")
+    def export(self, parcel: Parcel) -> Exported:
+        """Raise NotReady: see :attr:`blocker`."""
+        raise NotReady(f"the connection is {self.blocker}")
 
-    def release(self) -> None:
+    def detach(self) -> None:
         """Close the connection: no other process can have it."""
         self.close()
 

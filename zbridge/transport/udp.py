@@ -34,31 +34,31 @@ class _DatagramReader:
         self._kernel = kernel
         self._socket: socket.socket | None = None
         self._loop = asyncio.get_running_loop()
-        self._held = False
+        self._suspended = False
 
     def _listen(self, host: str, port: int) -> None:
         self._socket = self._kernel.datagrams(host, port)
-        self.go_on()
+        self.resume()
 
     def fileno(self) -> int:
         """Return the descriptor of the open socket."""
         assert self._socket is not None
         return self._socket.fileno()
 
-    def take_over(self, sock: socket.socket) -> None:
-        """Use a socket that another process bound; read nothing before :meth:`go_on`."""
+    def restore(self, sock: socket.socket) -> None:
+        """Use a socket that another process bound; read nothing before :meth:`resume`."""
         sock.setblocking(False)
-        self._socket, self._held = sock, True
+        self._socket, self._suspended = sock, True
 
-    def hold(self) -> None:
-        """Read nothing until :meth:`go_on`: what comes waits in the kernel."""
-        self._held = True
+    def suspend(self) -> None:
+        """Read nothing until :meth:`resume`: what comes waits in the kernel."""
+        self._suspended = True
         if self._socket is not None:
             self._loop.remove_reader(self._socket.fileno())
 
-    def go_on(self) -> None:
+    def resume(self) -> None:
         """Read again."""
-        self._held = False
+        self._suspended = False
         if self._socket is not None:
             self._loop.add_reader(self._socket.fileno(), self._read)
 
@@ -68,7 +68,7 @@ class _DatagramReader:
 
     def _read(self, most: int = _DATAGRAMS) -> None:
         for _ in range(most):
-            if self._socket is None or self._held:
+            if self._socket is None or self._suspended:
                 return
             try:
                 data, source = self._socket.recvfrom(_DATAGRAM_BYTES)
@@ -99,15 +99,15 @@ class DatagramSocket(_DatagramReader):
         self,
         transport: asyncio.Transport,
         receiver: Receiver,
-        given: socket.socket | None = None,
+        restored: socket.socket | None = None,
         kernel: Kernel = KERNEL,
     ) -> None:
-        """``given``: the socket of another process, that was held."""
+        """``restored``: the socket of another process, that was suspended."""
         super().__init__(kernel)
         self._receiver = receiver
         self._peer: tuple[str, int] = transport.get_extra_info("peername")[:2]
-        if given is not None:
-            self.take_over(given)
+        if restored is not None:
+            self.restore(restored)
         else:
             self._listen(transport.get_extra_info("sockname")[0], 0)
 

@@ -1,6 +1,1 @@
-"""Judges of this protocol: a vehicle and an HQ program as fragile as the deployed ones, and a parser of their own.
-
-They record each violation of what the protocol page ``alf.md`` demands, and die of what kills or breaks the deployed
-programs. They share no code with the gateway, so that an error there cannot hide here: not its messages, sessions or
-translation. Section names in the docstrings are those of that page.
-"""
+"""A vehicle and an HQ program that judge a gateway by the page ``alf.md`` (:mod:`zbridge.simulation.judge`)."""

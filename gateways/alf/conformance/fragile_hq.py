@@ -8,7 +8,7 @@ import socket
 import time
 from collections import deque
 from collections.abc import Iterable
-from typing import Literal, NamedTuple, NoReturn, Unpack
+from typing import Literal, NoReturn
 
 from gateways.alf.conformance import parser as wire
 from gateways.alf.conformance.parser import (
@@ -25,7 +25,7 @@ from gateways.alf.conformance.parser import (
 )
 from zbridge.simulation.fragile import Work
 from zbridge.simulation.hq_program import HqProgram
-from zbridge.simulation.judge import Bounds, Ended
+from zbridge.simulation.judge import Ended
 from zbridge.simulation.timing import Ticker
 
 Serves = Literal["auto", "drive", "laser", "both"]
@@ -38,16 +38,6 @@ _MOST_SCANS = 10
 """Measurements after which the deployed driving program stops reading."""
 FULL = {"text": 255, "binary": 100}
 """The speed that is full speed."""
-
-
-class LastScan(NamedTuple):
-    """The last measurement, as it was sent: points in mm, valid indices inclusive."""
-
-    sequence: int
-    stamp: int
-    points: tuple[int, ...]
-    first: int
-    last: int
 
 
 class FragileAlfHq(HqProgram):
@@ -76,16 +66,16 @@ class FragileAlfHq(HqProgram):
         stops_reading_after: int | None = None,
         answer_s: float = 2.0,
         flight_s: float = 1.0,
-        **bounds: Unpack[Bounds],
     ) -> None:
         if dialect not in FULL or serves not in ("auto", *_SERVED):
             raise ValueError(f"no such HQ: dialect {dialect!r}, serves {serves!r}")
-        super().__init__(**bounds)
+        super().__init__()
         self.dialect: Dialect = dialect
         self.scanner: Fields | None = None
         """The last message 2."""
         self.scans = 0
-        self.last_scan: LastScan | None = None
+        self.last_points: Fields = ()
+        """The points of the last measurement as they were sent, in mm."""
         self.infos: deque[Fields] = self._rows()
         """Every message 4."""
         self._serves: Serves = serves
@@ -236,8 +226,7 @@ class FragileAlfHq(HqProgram):
         else:
             if self.scanner is None and not self.scans:
                 self._violate("a measurement before the scanner init")
-            sequence, stamp, *points, first, last = map(int, message.fields)
-            self.scans, self.last_scan = self.scans + 1, LastScan(sequence, stamp, tuple(points), first, last)
+            self.scans, self.last_points = self.scans + 1, message.fields[2:-2]
             if self.scans == self._stops_after:
                 self._stopped = True
                 self._event(f"it reads no more, after {self.scans} measurements")

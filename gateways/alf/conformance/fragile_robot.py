@@ -6,13 +6,12 @@ import socket
 import time
 from collections.abc import Iterable
 from functools import partial
-from typing import Unpack
 
 from gateways.alf.conformance import parser as wire
 from gateways.alf.conformance.machine import JudgedVehicle
 from gateways.alf.conformance.parser import AlfTimes, Dialect, Fields, ParsedAlfMessage, Phase, Repeats, show
 from zbridge.simulation.fragile import FragileServer, Work, log_violations
-from zbridge.simulation.judge import Bounds, Chances
+from zbridge.simulation.judge import Chances
 from zbridge.simulation.sockets import drain, reset_on_close
 from zbridge.simulation.timing import Ticker
 
@@ -42,17 +41,16 @@ class FragileVehicle(FragileServer):
         seed: int = 1,
         times: AlfTimes = _DEPLOYED,
         machine: JudgedVehicle | None = None,
-        **bounds: Unpack[Bounds],
     ) -> None:
         if not (laser or drive) or dialect not in ("text", "binary"):
             raise ValueError(f"no such server: dialect {dialect!r}, laser {laser}, drive {drive}")
-        super().__init__(**bounds)
+        super().__init__()
         self.dialect: Dialect = dialect
         self.laser, self.drive = laser, drive
         chance = Chances(seed)
         self.machine = machine or JudgedVehicle(chance["machine"], points)
         self._times, self._repeats = times, Repeats(times)
-        self._reader = wire.reader(dialect, {wire.DRIVE, wire.END} if drive else {wire.END}, wire.FULL_PERCENT)
+        self._reader = wire.CommandReader(dialect, {wire.DRIVE, wire.END} if drive else {wire.END})
         self._phase = Phase.WAITING
         self._sequence = 0
         self._booted_s = time.monotonic() - chance["clock"].uniform(10, 3600)
@@ -95,7 +93,6 @@ class FragileVehicle(FragileServer):
         self._phase = Phase.OVER
 
     def _finish(self, why: str) -> None:
-        """Leave the connection."""
         self._event(why)
         self._shut()
         self._phase, self._conn = Phase.OVER, None
@@ -235,7 +232,10 @@ class FragileVehicle(FragileServer):
 def fragile_vehicle(dialect: Dialect, *, servers: int, seed: int, times: AlfTimes = _DEPLOYED) -> list[FragileVehicle]:
     """Make the servers of one vehicle: one for everything, or one that drives and one that measures ("Roles")."""
     server = partial(FragileVehicle, dialect, seed=seed, times=times)
-    if servers == 1:
-        return [server(laser=True, drive=True, note=log_violations("vehicle"))]
-    drive = server(laser=False, drive=True, note=log_violations("drive"))
-    return [drive, server(laser=True, drive=False, machine=drive.machine, note=log_violations("laser"))]
+    drive = server(laser=servers == 1, drive=True)
+    made = {"vehicle" if servers == 1 else "drive": drive}
+    if servers > 1:
+        made["laser"] = server(laser=True, drive=False, machine=drive.machine)
+    for name, one in made.items():
+        one.note = log_violations(name)
+    return list(made.values())

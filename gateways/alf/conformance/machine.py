@@ -47,7 +47,6 @@ class JudgedVehicle:
         self.light = bool(light)
 
     def stop(self) -> None:
-        """Stop the motor."""
         self._target_m_s = 0.0
 
     def step(self, dt: float) -> None:

@@ -115,13 +115,11 @@ def show(data: bytes, dialect: Dialect, limit: int = 60) -> str:
     return shorten(repr(data[:limit])[1:], data, limit) if dialect == "text" else show_hex(data, limit)
 
 
-def reader(dialect: Dialect, ids: Collection[int], speed_full: int) -> CommandReader:
-    """Make the reader of a vehicle's server."""
-    return CommandReader(dialect, ids, speed_full)
-
-
 class _AlfReader(MessageReader[ParsedAlfMessage]):
-    """Cuts the stream of a peer in either dialect. ``counts``: of the fields, by the id of a known message."""
+    """Cuts and judges the stream of a peer in either dialect. ``counts``: of the fields, by the id of a known message.
+
+    A protocol role contributes what it knows of the fields: :meth:`_read_text`, :meth:`_breaks` and :meth:`_wrong`.
+    """
 
     _unknown: str
 
@@ -164,6 +162,26 @@ class _AlfReader(MessageReader[ParsedAlfMessage]):
         raise NotImplementedError
 
     def _judge(self, kind: int, fields: Fields, raw: bytes) -> ParsedAlfMessage:
+        """Judge a message by its fields ("The gateway as vehicle": what they break on; "Dialect ...")."""
+        breaks = self._breaks(kind, fields)
+        if breaks:
+            problem = breaks
+        elif kind not in self._counts:
+            problem = f"id {kind}, {self._unknown}"
+        elif len(fields) != self._counts[kind]:
+            problem = f"{len(fields)} fields instead of {self._counts[kind]}"
+        elif self._dialect == "text" and not _FORMS.get(kind, INTEGERS).fullmatch(raw):
+            problem = "not written as std::to_string prints numbers"
+        else:
+            problem = self._wrong(kind, fields)
+        return ParsedAlfMessage(kind, fields, raw, problem, deadly=bool(breaks))
+
+    def _breaks(self, kind: int, fields: Fields) -> str:
+        """Tell what the reader breaks on, empty if on nothing."""
+        return ""
+
+    def _wrong(self, kind: int, fields: Fields) -> str:
+        """Tell what is wrong with the values of a message of the right length, where nothing breaks."""
         raise NotImplementedError
 
 
@@ -172,9 +190,9 @@ class CommandReader(_AlfReader):
 
     _unknown = "of which this server knows nothing"
 
-    def __init__(self, dialect: Dialect, ids: Collection[int], speed_full: int) -> None:
+    def __init__(self, dialect: Dialect, ids: Collection[int]) -> None:
         super().__init__(dialect, {kind: _COUNTS[kind] for kind in ids})
-        speeds = (0, speed_full if dialect == "text" else 255)
+        speeds = (0, FULL_PERCENT if dialect == "text" else 255)
         self._bounds = {DRIVE: (speeds, (0, 1), ANGLES[dialect], (0, 1)), END: ((1, 1),)}
 
     def _read_text(self, raw: bytes) -> ParsedAlfMessage:
@@ -183,20 +201,11 @@ class CommandReader(_AlfReader):
         if problem or not numbers:
             return ParsedAlfMessage(NO_ID, (), raw, problem or "a message without a number", deadly=bool(problem))
         kind, *fields = map(integer, numbers)
+        if not INTEGERS.fullmatch(raw):
+            return ParsedAlfMessage(kind, tuple(fields), raw, "not written as std::to_string prints integers")
         return self._judge(kind, tuple(fields), raw)
 
-    def _judge(self, kind: int, fields: Fields, raw: bytes) -> ParsedAlfMessage:
-        if self._dialect == "text" and not INTEGERS.fullmatch(raw):
-            problem = "not written as std::to_string prints integers"
-        elif kind not in self._counts:
-            problem = f"id {kind}, {self._unknown}"
-        elif len(fields) != self._counts[kind]:
-            problem = f"{len(fields)} fields instead of {self._counts[kind]}"
-        else:
-            problem = self._out_of_bounds(kind, fields)
-        return ParsedAlfMessage(kind, fields, raw, problem)
-
-    def _out_of_bounds(self, kind: int, fields: Fields) -> str:
+    def _wrong(self, kind: int, fields: Fields) -> str:
         names = _DRIVE_FIELDS if kind == DRIVE else ("end",)
         for name, value, (low, high) in zip(names, fields, self._bounds[kind], strict=True):
             if not low <= value <= high:
@@ -220,27 +229,15 @@ class VehicleReader(_AlfReader):
             return ParsedAlfMessage(NO_ID, (), raw, "a message without an id")
         kind = NO_ID if deadly(first) else integer(first)
         is_float = [at in _FLOATS.get(kind, ()) for at in range(len(numbers))]
-        breaks = ["NaN" if b"nan" in raw.lower() else "", deadly(first), *map(_breaks, numbers, is_float)]
+        breaks = ["NaN" if b"nan" in raw.lower() else "", deadly(first)]
+        for number, real in zip(numbers, is_float, strict=True):  # a float may be large, but needs its leading digit
+            breaks.append("" if real and not number.lstrip("-").startswith(".") else deadly(number))
         if problem := next(filter(None, breaks), ""):
             return ParsedAlfMessage(kind, (), raw, problem, deadly=True)
         fields = (float(number) if real else integer(number) for number, real in zip(numbers, is_float, strict=True))
         return self._judge(kind, tuple(fields), raw)
 
-    def _judge(self, kind: int, fields: Fields, raw: bytes) -> ParsedAlfMessage:
-        """Judge a message by its fields ("The gateway as vehicle": what they break on; "Dialect ...")."""
-        if breaks := self._deadly(kind, fields):
-            return ParsedAlfMessage(kind, fields, raw, breaks, deadly=True)
-        if kind not in self._counts:
-            problem = f"id {kind}, {self._unknown}"
-        elif len(fields) != self._counts[kind]:
-            problem = f"{len(fields)} fields instead of {self._counts[kind]}"
-        elif self._dialect == "text" and not _FORMS.get(kind, INTEGERS).fullmatch(raw):
-            problem = "not written as std::to_string prints numbers"
-        else:
-            problem = self._wrong(kind, fields)
-        return ParsedAlfMessage(kind, fields, raw, problem)
-
-    def _deadly(self, kind: int, fields: Fields) -> str:
+    def _breaks(self, kind: int, fields: Fields) -> str:
         if kind == SCAN and len(fields) > self._counts[SCAN]:
             return f"{len(fields) - _NOT_POINTS} points instead of {self._points}"
         if any(map(math.isnan, fields)):
@@ -249,7 +246,6 @@ class VehicleReader(_AlfReader):
         return f"an integer over 2^31-1, {over[0]}" if over else ""
 
     def _wrong(self, kind: int, fields: Fields) -> str:
-        """Tell what is wrong with the values, where nothing breaks."""
         if not all(map(math.isfinite, fields)):
             return "an infinite number"
         if kind == END and fields[0] != 1:
@@ -262,12 +258,6 @@ class VehicleReader(_AlfReader):
         if not (0 <= first < self._points and 0 <= last < self._points):
             return f"valid indices {first} and {last} of {self._points} points"
         return ""
-
-
-def _breaks(number: str, is_float: bool) -> str:
-    """Tell why an HQ breaks on a number: a float may be large, but needs its leading digit."""
-    bare = number.lstrip("-").startswith(".")
-    return deadly(number) if bare or not is_float else ""
 
 
 class Repeats:

@@ -11,7 +11,6 @@ import struct
 import time
 from collections import Counter
 from collections.abc import Iterable
-from typing import Unpack
 
 import msgspec
 
@@ -19,7 +18,7 @@ from gateways.tcpudp.conformance import parser as wire
 from gateways.tcpudp.conformance.operator import OperatorProgram
 from gateways.tcpudp.conformance.parser import Channel, FeatureFlag, ParsedPacket
 from zbridge.simulation.fragile import Work
-from zbridge.simulation.judge import Bounds, Ended, show
+from zbridge.simulation.judge import Ended, show
 from zbridge.simulation.timing import STAMPED, Read, ReadingThread
 
 _SMALLEST_READ = 6
@@ -75,11 +74,10 @@ class FragileTcpUdpHq(OperatorProgram):
         repeat_s: float | None = 0.5,
         udp_port: int | None = None,
         times: HqTimes = _DEPLOYED,
-        **bounds: Unpack[Bounds],
     ) -> None:
         if version not in wire.HQ_SENT or (lidar_sim and wire.FLAGS[version] <= FeatureFlag.LIDAR_SIM):
             raise ValueError(f"no HQ of version {version}" + " announces LidarSim" * lidar_sim)
-        super().__init__(**bounds)
+        super().__init__()
         self.version = version
         self.established = asyncio.Event()
         self.settings: wire.RobotAnnouncement | None = None
@@ -281,7 +279,7 @@ class FragileTcpUdpHq(OperatorProgram):
             self._conclude(any(body))
         elif kind == wire.DEBUG:
             self.texts.append(body[4:].decode("ascii"))
-            del self.texts[: -self._keep]
+            del self.texts[: -self.KEEP]
         elif kind == wire.LIDAR_STATUS:
             self.lidar_on = body[0] == 1
         elif kind == wire.POSITION:

@@ -10,13 +10,12 @@ import random
 import socket
 import time
 from collections.abc import Collection, Iterable
-from typing import Unpack
 
 from gateways.tcpudp.conformance import parser as wire
 from gateways.tcpudp.conformance.machine import JudgedRobot, Loss, Quirks
 from gateways.tcpudp.conformance.parser import Channel, FeatureFlag, ParsedPacket, RobotTimes
 from zbridge.simulation.fragile import FragileServer, Work
-from zbridge.simulation.judge import Bounds, Chances, show
+from zbridge.simulation.judge import Chances, show
 from zbridge.simulation.sockets import bind_tcp_and_udp, readable
 from zbridge.simulation.timing import PollingReader, Ticker
 
@@ -62,9 +61,8 @@ class FragileRobot(FragileServer):
         features: Collection[FeatureFlag] | None = None,
         times: RobotTimes = _DEPLOYED,
         quirks: Quirks = _NO_QUIRKS,
-        **bounds: Unpack[Bounds],
     ) -> None:
-        super().__init__(**bounds)
+        super().__init__()
         self.version = version
         self.features = wire.announcement(version, features, udp=udp)
         self.client_id = quirks.client_id or random.Random(seed).randint(1, 255)
@@ -85,7 +83,6 @@ class FragileRobot(FragileServer):
         self._forget()
 
     def _forget(self) -> None:
-        """Forget the HQ."""
         self._reads = wire.Reads()
         self._ignores_next = False
         self._awake = asyncio.Event()
@@ -122,7 +119,6 @@ class FragileRobot(FragileServer):
         self._start(self._converse(conn))
 
     def cut(self) -> None:
-        """Break the connection."""
         self._shut()
 
     async def _converse(self, conn: socket.socket) -> None:

@@ -5,18 +5,17 @@ from __future__ import annotations
 import struct
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Literal, Unpack
+from typing import Literal
 
 from gateways.tcpudp.conformance import parser as wire
 from zbridge.simulation.hq_program import HqProgram
-from zbridge.simulation.judge import Bounds
 
 
 class OperatorProgram(HqProgram):
     """The sticks and buttons of an HQ program."""
 
-    def __init__(self, **bounds: Unpack[Bounds]) -> None:
-        super().__init__(**bounds)
+    def __init__(self) -> None:
+        super().__init__()
         self._stick, self._joystick = (wire.STOP, b""), False
 
     @abstractmethod

@@ -291,15 +291,7 @@ def deadly(version: str, settings: HqAnnouncement) -> bool:
 
 def registered(version: str, features: Collection[FeatureFlag]) -> frozenset[int]:
     """Tell which packet ids from the HQ do not crash a robot ("Packets", "The gateway as HQ")."""
-    ids = {DEBUG, CLIENT_SETTINGS}
-    if FeatureFlag.UDP in features:
-        ids |= {UDP_PROBE, UDP_STATUS}
-    if FeatureFlag.JOYSTICK in features:
-        ids |= {MODE, MOVE, ROTATE, STOP, MOVE_AI}
-    if FeatureFlag.CHAT in features:
-        ids |= {CHAT}
-    if FeatureFlag.LIDAR in features:
-        ids |= {LIDAR_MODE}
+    ids = {DEBUG, CLIENT_SETTINGS}.union(*(_REGISTERED.get(feature, ()) for feature in features))
     if maps(version, features):
         ids |= {GET_MAP, GET_POSITION}
     if FeatureFlag.LIDAR_SIM in features and FLAGS[version] > FeatureFlag.LIDAR_SIM:
@@ -381,6 +373,12 @@ def _map(body: bytes) -> str:
     return "" if math.isqrt(count) ** 2 == count else f"a map of {count} cells, no square"
 
 
+_REGISTERED = {
+    FeatureFlag.UDP: (UDP_PROBE, UDP_STATUS),
+    FeatureFlag.JOYSTICK: (MODE, MOVE, ROTATE, STOP, MOVE_AI),
+    FeatureFlag.CHAT: (CHAT,),
+    FeatureFlag.LIDAR: (LIDAR_MODE,),
+}
 _SIZES = {
     **dict.fromkeys((START_UDP, UDP_PROBE, STOP, GET_MAP, GET_POSITION, GET_SCAN), 0),
     **dict.fromkeys((UDP_ANSWER, UDP_STATUS), 1),

@@ -7,13 +7,13 @@ import math
 import struct
 import time
 from collections.abc import Iterable
-from typing import NoReturn, Unpack
+from typing import NoReturn
 
 from gateways.wc2ec.conformance import parser as wire
 from gateways.wc2ec.conformance.parser import ControllerReader, Dialect, ParsedWc2EcMessage
 from zbridge.simulation.fragile import Work
 from zbridge.simulation.hq_program import HqProgram
-from zbridge.simulation.judge import Bounds, Ended, show
+from zbridge.simulation.judge import Ended, show
 
 MOTOR_TYPES = (53, 46)
 """Rotational and linear motors; the numbers move with the Webots version."""
@@ -35,11 +35,10 @@ class FragileExternalController(HqProgram):
         dialect: Dialect = "deployed",
         split: bool = False,
         flight_s: float = 0.5,
-        **bounds: Unpack[Bounds],
     ) -> None:
         if dialect not in wire.DATA:
             raise ValueError(f"no such controller: dialect {dialect!r}")
-        super().__init__(**bounds)
+        super().__init__()
         self.dialect: Dialect = dialect
         self.ready = asyncio.Event()
         """Set by the first data after the connection: before that it does nothing ("The gateway as Webots ...")."""
@@ -198,8 +197,10 @@ class FragileExternalController(HqProgram):
 
     def _measure(self, message: ParsedWc2EcMessage, value: float, raw: str) -> None:
         number = message.number
-        if self.dialect == "draft":
-            self._unasked(number, raw)
+        if self.dialect == "draft":  # 128, 129
+            disabled_s = time.monotonic() - self._disabled.get(number, -math.inf)
+            if number not in self.enabled and disabled_s > self._flight_s:
+                self._violate(f"data of sensor {number}, which is not enabled: {raw}")
         elif number not in self.devices:
             self._violate(f"data of number {number}, which is not registered: {raw}")
         elif self.devices[number][0] != message.node_type:
@@ -210,9 +211,3 @@ class FragileExternalController(HqProgram):
         self.ready.set()
         self.values[number] = value
         self.counts[number] = self.counts.get(number, 0) + 1
-
-    def _unasked(self, number: int, raw: str) -> None:
-        """Judge data of a sensor that is not enabled ("Dialect `draft`" 128, 129)."""
-        disabled_s = time.monotonic() - self._disabled.get(number, -math.inf)
-        if number not in self.enabled and disabled_s > self._flight_s:
-            self._violate(f"data of sensor {number}, which is not enabled: {raw}")

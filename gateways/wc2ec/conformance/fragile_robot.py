@@ -6,7 +6,7 @@ import asyncio
 import socket
 import time
 from collections.abc import Sequence
-from typing import NoReturn, Unpack
+from typing import NoReturn
 
 from gateways.wc2ec.conformance import parser as wire
 from gateways.wc2ec.conformance.machine import JudgedMotor, JudgedWebots
@@ -19,7 +19,7 @@ from gateways.wc2ec.conformance.parser import (
     Wc2EcTimes,
 )
 from zbridge.simulation.fragile import FragileServer
-from zbridge.simulation.judge import Bounds, Chances, Ended, show
+from zbridge.simulation.judge import Chances, Ended, show
 from zbridge.simulation.sockets import drain, reset_on_close
 from zbridge.simulation.timing import Ticker
 
@@ -47,11 +47,10 @@ class FragileWebotsController(FragileServer):
         seed: int = 1,
         values: int = 3,
         times: Wc2EcTimes = _DEPLOYED,
-        **bounds: Unpack[Bounds],
     ) -> None:
         if dialect not in DEFAULT:
             raise ValueError(f"no such controller: dialect {dialect!r}")
-        super().__init__(**bounds)
+        super().__init__()
         self.dialect: Dialect = dialect
         self.devices = tuple(DEFAULT[dialect] if devices is None else devices)
         wire.check(dialect, self.devices)

@@ -33,13 +33,11 @@ class JudgedMotor:
         return f"<JudgedMotor {self.device.name!r} {self.velocity:g} at {self.position:g}, set to {self.target:g}>"
 
     def set(self, value: float) -> None:
-        """Take a setValue."""
         self.target = value
         if self.device.kind is DeviceKind.ROTATIONAL:
             self.velocity = value
 
     def step(self, dt: float) -> None:
-        """Move for ``dt`` seconds."""
         way = self.target - self.position
         if self.device.kind is DeviceKind.LINEAR and abs(way) <= _LINEAR_M_S * dt:
             self.position, self.velocity = self.target, way / dt if way else 0.0

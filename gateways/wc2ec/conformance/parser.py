@@ -84,7 +84,7 @@ class Wc2EcTimes(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ParsedWc2EcMessage(msgspec.Struct, frozen=True):
-    """One message: header and value, what is wrong with it, and whether it kills or blocks the judge."""
+    """One message: header and value, what is wrong with it, and whether it kills the judge."""
 
     command: int
     node_type: int
@@ -93,7 +93,6 @@ class ParsedWc2EcMessage(msgspec.Struct, frozen=True):
     raw: bytes
     problem: str = ""
     deadly: bool = False
-    blocks: bool = False
 
 
 def check(dialect: Dialect, devices: Collection[SimulatedDevice]) -> None:
@@ -172,9 +171,7 @@ class ExternalReader(_Wc2EcReader):
         return _HEADER + {ENABLE: 0, DISABLE: 0, CHANGE: 9, SET: 8 * self._values}[data[0]]
 
     def _read(self, raw: bytes) -> ParsedWc2EcMessage:
-        message = self._deployed(raw) if self._dialect == "deployed" else self._draft(raw)
-        self.dead = self.blocked = message.blocks
-        return message
+        return self._deployed(raw) if self._dialect == "deployed" else self._draft(raw)
 
     def _deployed(self, raw: bytes) -> ParsedWc2EcMessage:
         """Judge a setValue ("send 130 only to registered motors"; "NaN and infinities")."""
@@ -189,9 +186,8 @@ class ExternalReader(_Wc2EcReader):
         else:
             problem = "" if math.isfinite(value) else f"{value} to motor {device.name!r}"
             return ParsedWc2EcMessage(command, node_type, number, value, raw, problem)
-        return ParsedWc2EcMessage(
-            command, node_type, number, value, raw, f"{problem}: every later command is stuck", blocks=True
-        )
+        self.dead = self.blocked = True
+        return ParsedWc2EcMessage(command, node_type, number, value, raw, f"{problem}: every later command is stuck")
 
     def _draft(self, raw: bytes) -> ParsedWc2EcMessage:
         command, node_type, number = raw[:_HEADER]

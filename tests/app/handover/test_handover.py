@@ -12,8 +12,7 @@ from collections.abc import AsyncIterator
 import pytest
 
 from zbridge.app.handover.channel import VERSION, Go, HandoverChannel, HandoverState, Hello, Up
-from zbridge.app.handover.incoming import Incoming
-from zbridge.app.handover.outgoing import Outgoing
+from zbridge.app.handover.sequence import Incoming, Outgoing
 from zbridge.errors import HandoverError, NotReady, Refused, Unsupported
 from zbridge.protocol.kept import Exported
 from zbridge.transport import Parcel
@@ -27,6 +26,9 @@ class PlayedPart:
     def __init__(self, steps: list[str]) -> None:
         self._steps = steps
         self.refuses: Refused | None = None
+        self.drained = asyncio.Event()
+        """Set when what was published has left."""
+        self.drained.set()
 
     async def prepare(self, reason: str, within_s: float) -> None:
         self._steps.append("prepare")
@@ -36,20 +38,21 @@ class PlayedPart:
     async def shut(self) -> None:
         self._steps.append("shut")
 
-    def hold(self) -> None:
-        self._steps.append("hold")
+    def suspend(self) -> None:
+        self._steps.append("suspend")
 
-    def hand_over(self, parcel: Parcel) -> Exported:
+    def export(self, parcel: Parcel) -> Exported:
         return {}
 
-    async def go_on(self) -> None:
-        self._steps.append("go on")
+    async def resume(self) -> None:
+        self._steps.append("resume")
 
-    def withdraw(self) -> None:
+    async def withdraw(self) -> None:
         self._steps.append("withdraw")
+        await self.drained.wait()
 
-    async def release(self) -> None:
-        self._steps.append("release")
+    async def detach(self) -> None:
+        self._steps.append("detach")
 
 
 class PlayedSuccessor:
@@ -92,12 +95,7 @@ class Scene:
         self.successor = PlayedSuccessor(self.steps, looks_after=looks_after)
         describe = lambda parcel: HandoverState(VERSION, {}, 0)  # noqa: E731
         self.part = PlayedPart(self.steps)
-        self.outgoing = Outgoing(self.successor, lambda: [self.part], describe, self._drain)
-        self.drained = asyncio.Event()
-        self.drained.set()
-
-    async def _drain(self) -> None:
-        await self.drained.wait()
+        self.outgoing = Outgoing(self.successor, lambda: [self.part], describe)
 
     async def begun(self) -> asyncio.Task[int]:
         """Begin to hand over, until the successor is started."""
@@ -108,7 +106,7 @@ class Scene:
 
     async def up(self) -> asyncio.Task[int]:
         """Hand over until the successor is up; give the task, which waits to say *go*."""
-        self.drained.clear()
+        self.part.drained.clear()
         running = await self.begun()
         await self.successor.comes_up()
         while "withdraw" not in self.steps:  # noqa: ASYNC110
@@ -132,19 +130,21 @@ async def test_the_supervisor_is_told_before_the_successor_hears_go(scene: Scene
     with pytest.raises(HandoverError, match="sent nothing"):
         await scene.successor.channel.receive(Go, 0.01)
     assert "handed over" not in scene.steps
-    scene.drained.set()
+    scene.part.drained.set()
     await scene.successor.channel.receive(Go, SOON_S)
     assert await running == scene.successor.process.pid
-    assert scene.steps == ["prepare", "shut", "hold", "withdraw", "handed over", "release"]
+    assert scene.steps == ["prepare", "shut", "suspend", "withdraw", "handed over", "detach"]
 
 
 @supervised
 async def test_from_go_on_nothing_leads_back_where_a_supervisor_looks_after_the_robot(scene: Scene) -> None:
     running = await scene.up()
     scene.successor.dies()
-    scene.drained.set()
+    scene.part.drained.set()
     await running
-    assert scene.steps == ["prepare", "shut", "hold", "withdraw", "handed over", "release"], "the successor has crashed"
+    assert scene.steps == ["prepare", "shut", "suspend", "withdraw", "handed over", "detach"], (
+        "the successor has crashed"
+    )
 
 
 @alone
@@ -153,19 +153,19 @@ async def test_a_successor_that_cannot_be_told_to_go_leaves_everything_where_nob
 ) -> None:
     running = await scene.up()
     scene.successor.dies()
-    scene.drained.set()
+    scene.part.drained.set()
     with pytest.raises(NotReady, match="the other side has ended"):
         await running
-    assert scene.steps[-1] == "go on"
+    assert scene.steps[-1] == "resume"
 
 
 async def test_a_gateway_that_ends_meanwhile_takes_everything_back_first(scene: Scene) -> None:
     running = await scene.up()
     scene.outgoing.give_up()
-    scene.drained.set()
+    scene.part.drained.set()
     with pytest.raises(NotReady, match="the gateway ends"):
         await running
-    assert scene.steps == ["prepare", "shut", "hold", "withdraw", "go on"]
+    assert scene.steps == ["prepare", "shut", "suspend", "withdraw", "resume"]
     assert scene.successor.process.wait(SOON_S) == -signal.SIGKILL, "before it goes on"
 
 
@@ -183,21 +183,21 @@ async def test_a_gateway_that_ends_before_its_successor_says_hello_waits_for_not
 
 async def test_from_go_on_a_gateway_that_ends_leaves_everything_to_its_successor(scene: Scene) -> None:
     running = await scene.up()
-    scene.drained.set()
+    scene.part.drained.set()
     await scene.successor.channel.receive(Go, SOON_S)
     scene.outgoing.give_up()
     await running
-    assert scene.steps[-1] == "release"
+    assert scene.steps[-1] == "detach"
 
 
 @supervised
 async def test_without_the_supervisors_ear_nothing_is_handed_over(scene: Scene) -> None:
     running = await scene.up()
     scene.successor.unheard = True
-    scene.drained.set()
+    scene.part.drained.set()
     with pytest.raises(NotReady, match="does not listen"):
         await running
-    assert scene.steps[-1] == "go on"
+    assert scene.steps[-1] == "resume"
     assert scene.successor.process.wait(SOON_S) == -signal.SIGKILL, "before it goes on"
 
 
@@ -218,7 +218,7 @@ async def test_a_part_that_cannot_be_handed_over_refuses_the_restart_and_everyth
     await scene.successor.channel.send(Hello(VERSION, scene.successor.process.pid))
     with pytest.raises(Unsupported, match="this robot cannot be handed over"):
         await running
-    assert scene.steps == ["prepare", "go on"]
+    assert scene.steps == ["prepare", "resume"]
     assert scene.successor.process.wait(SOON_S) == -signal.SIGKILL
 
 
@@ -227,7 +227,7 @@ async def test_a_gateway_that_ends_meanwhile_takes_everything_back_to_take_leave
     running.cancel()
     with pytest.raises(asyncio.CancelledError):
         await running
-    assert scene.steps[-1] == "go on"
+    assert scene.steps[-1] == "resume"
     assert scene.successor.process.wait(SOON_S) == -signal.SIGKILL
 
 

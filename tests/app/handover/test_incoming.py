@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from zbridge.app.handover.channel import VERSION, Failed, Go, HandoverChannel, HandoverState, Hello, Up
-from zbridge.app.handover.incoming import Incoming
+from zbridge.app.handover.sequence import Incoming
 from zbridge.errors import HandoverError
 from zbridge.transport import Parcel
 
@@ -38,7 +38,8 @@ async def received(
     hello = await before.receive(Hello, SOON_S)
     assert (hello.version, hello.pid) == (VERSION, os.getpid())
     await before.send(given, parcel)
-    return await receiving
+    await receiving
+    return incoming.state
 
 
 async def test_state_and_descriptors_are_taken_over_together(pair: tuple[HandoverChannel, Incoming]) -> None:
@@ -46,7 +47,7 @@ async def test_state_and_descriptors_are_taken_over_together(pair: tuple[Handove
         parcel = Parcel()
         parcel.put(server.fileno())
         given = HandoverState(VERSION, SETUP, len(parcel), claim={"since": 1.0}, device={"a": 1}, listeners=({"b": 2},))
-        assert await received(pair, given, parcel) == given == pair[1].state
+        assert await received(pair, given, parcel) == given
         parcel.close()
         (taken,) = pair[1].parcel.descriptors
         assert os.fstat(taken).st_ino == os.fstat(server.fileno()).st_ino
@@ -66,7 +67,7 @@ CHANGED: list[tuple[dict[str, Any], str]] = [
 async def test_what_another_version_or_another_configuration_made_is_refused(
     pair: tuple[HandoverChannel, Incoming], fields: dict[str, Any], told: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("zbridge.app.handover.incoming.PARCEL_S", 0.05)
+    monkeypatch.setattr("zbridge.app.handover.sequence.PARCEL_S", 0.05)
     with pytest.raises(HandoverError, match=told):
         await received(pair, HandoverState(**{"version": VERSION, "setup": SETUP, "descriptors": 0, **fields}))
 
@@ -76,10 +77,10 @@ async def test_it_is_up_when_the_last_part_is_taken_over_and_every_part_begins_a
 ) -> None:
     before, incoming = pair
     await received(pair, HandoverState(VERSION, SETUP, 0, device={}, listeners=({}, {})))
-    parts = [asyncio.ensure_future(incoming.part_taken_over()) for _ in range(2)]
+    parts = [asyncio.ensure_future(incoming.part_restored()) for _ in range(2)]
     with pytest.raises(HandoverError, match="sent nothing"):
         await before.receive(Up, 0.02)
-    parts.append(asyncio.ensure_future(incoming.part_taken_over()))
+    parts.append(asyncio.ensure_future(incoming.part_restored()))
     await before.receive(Up, SOON_S)
     assert not any(part.done() for part in parts)
     assert not incoming.begun.is_set()
@@ -91,7 +92,7 @@ async def test_it_is_up_when_the_last_part_is_taken_over_and_every_part_begins_a
 async def test_a_robot_that_is_not_served_is_no_part(pair: tuple[HandoverChannel, Incoming]) -> None:
     before, incoming = pair
     await received(pair, HandoverState(VERSION, SETUP, 0, listeners=({},)))
-    part = asyncio.ensure_future(incoming.part_taken_over())
+    part = asyncio.ensure_future(incoming.part_restored())
     await before.receive(Up, SOON_S)
     await before.send(Go())
     await part

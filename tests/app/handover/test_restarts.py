@@ -12,8 +12,8 @@ import pytest
 from zbridge.app.config import GatewayPlan, plan
 from zbridge.app.handover import restarts as module
 from zbridge.app.handover.channel import VERSION, HandoverState
-from zbridge.app.handover.incoming import Incoming
 from zbridge.app.handover.restarts import ClaimPart, Restarts
+from zbridge.app.handover.sequence import ColdStart, Incoming
 from zbridge.bus.fake import FakeBus
 from zbridge.errors import NotReady, Refused
 from zbridge.fleet.topics import KeySpace
@@ -23,6 +23,7 @@ from zbridge.transport import Parcel
 
 DEVICE = {"protocol": "alf", "connect": ["tcp://127.0.0.1:1"]}
 ASKED = "fleet/r1/@rpc/restart/ann"
+CLAIMED = {"since": 2.0, "yielded": False, "close_until": 4.0}
 
 
 def planned(**bus: Any) -> GatewayPlan:
@@ -35,10 +36,10 @@ class Part:
     def __init__(self, told: Exported | None) -> None:
         self.told = told
 
-    def hand_over(self, parcel: Parcel) -> Exported:
+    def export(self, parcel: Parcel) -> Exported:
         return self.told or {}
 
-    def keep(self, parcel: Parcel, budget: Budget) -> Exported | None:
+    def deposit(self, parcel: Parcel, budget: Budget) -> Exported | None:
         return self.told
 
 
@@ -74,10 +75,9 @@ class PlayedOutgoing:
         successor: object,
         parts: Callable[[], list[Any]],
         describe: Callable[[Parcel], HandoverState],
-        drain: Callable[[], Any],
         *machine: object,
     ) -> None:
-        self.parts, self.describe, self.drain = parts, describe, drain
+        self.parts, self.describe = parts, describe
         self.end: asyncio.Future[int] = asyncio.get_running_loop().create_future()
         self.made.append(self)
 
@@ -93,7 +93,7 @@ def handovers(monkeypatch: pytest.MonkeyPatch) -> list[PlayedOutgoing]:
 
 
 def made(config: GatewayPlan | None = None, incoming: Incoming | None = None, successor: Any = "some") -> Restarts:
-    return Restarts(config or planned(), KeySpace("fleet", "r1"), incoming, successor)
+    return Restarts(config or planned(), KeySpace("fleet", "r1"), incoming or ColdStart(), successor)
 
 
 async def asked(restarts: Restarts, bus: FakeBus, key: str = ASKED) -> Any:
@@ -192,19 +192,15 @@ async def test_everything_the_gateway_has_is_described_in_order(handovers: list[
         await running
 
 
-async def test_latches_are_on_disk_and_the_claim_is_off_the_bus_before_the_successor_begins(
-    handovers: list[PlayedOutgoing],
-) -> None:
-    restarts, bus, latches = made(), Drained(), Latches()
-    running = asyncio.ensure_future(restarts.restart())
-    await asyncio.sleep(0)
-    await handovers[0].drain()
-    assert bus.drained == [], "a gateway without a bus and a claim has nothing to wait for"
-    restarts.bus, restarts.latches, restarts.claim = bus, latches, Part({})  # type: ignore[assignment]
-    await handovers[0].drain()
+async def test_latches_are_on_disk_and_the_claim_is_off_the_bus_before_the_successor_begins() -> None:
+    bus, latches = Drained(), Latches()
+    ownership = Ownership(bus, KeySpace("fleet", "r1"), clock=lambda: 5.0)
+    part = ClaimPart(ownership, latches)  # type: ignore[arg-type]
+    await part.restore(CLAIMED, Parcel())
+    await part.resume()
+    await part.withdraw()
+    assert ownership.export() is None
     assert (bus.drained, latches.flushed) == (["fleet/r1/@rpc/claim/gateway"], True)
-    handovers[0].end.set_result(7)
-    await running
 
 
 @pytest.mark.parametrize(
@@ -225,15 +221,25 @@ def test_a_robot_is_kept_for_a_successor_only_where_it_is_owned_and_can_go_on(
 
 async def test_a_claim_that_is_withdrawn_for_the_successor_is_still_deposited_and_comes_back() -> None:
     ownership = Ownership(FakeBus("1"), KeySpace("fleet", "r1"), clock=lambda: 5.0)
-    part = ClaimPart(ownership)
-    assert part.hand_over(Parcel()) == {}
-    claim = {"since": 2.0, "yielded": False, "close_until": 4.0}
-    ownership.inherit(claim)
-    assert part.hand_over(Parcel()) == claim
-    part.withdraw()
+    part = ClaimPart(ownership, Latches())  # type: ignore[arg-type]
+    assert part.export(Parcel()) == {}
+    ownership.restore(CLAIMED)
+    assert part.export(Parcel()) == CLAIMED
+    await part.withdraw()
     assert ownership.export() is None
-    assert part.hand_over(Parcel()) == claim, "the successor may die before it has deposited any"
-    await part.go_on()
-    assert ownership.export() == claim
+    assert part.export(Parcel()) == CLAIMED, "the successor may die before it has deposited any"
+    await part.resume()
+    assert ownership.export() == CLAIMED
     ownership.release()
-    assert part.hand_over(Parcel()) == {}
+    assert part.export(Parcel()) == {}
+
+
+async def test_a_robot_that_was_left_to_another_gateway_during_a_restart_that_fails_is_not_claimed_again() -> None:
+    ownership = Ownership(FakeBus("1"), KeySpace("fleet", "r1"), clock=lambda: 5.0)
+    part = ClaimPart(ownership, Latches())  # type: ignore[arg-type]
+    ownership.restore(CLAIMED)
+    await part.prepare("gateway restarted", 1.0)
+    assert part.export(Parcel()) == CLAIMED
+    ownership.release()
+    await part.resume()
+    assert ownership.export() is None

@@ -12,6 +12,7 @@ import pytest
 from zbridge.app.config import plan
 from zbridge.app.handover.channel import VERSION, HandoverChannel, HandoverState, Hello
 from zbridge.app.handover.restarts import Restarts
+from zbridge.app.handover.sequence import ColdStart
 from zbridge.errors import HandoverError, NotReady
 from zbridge.fleet.topics import KeySpace
 from zbridge.protocol.kept import Exported
@@ -31,20 +32,20 @@ class PlayedPart:
     async def shut(self) -> None:
         pass
 
-    def hold(self) -> None:
-        self.steps.append("hold")
+    def suspend(self) -> None:
+        self.steps.append("suspend")
 
-    def hand_over(self, parcel: Parcel) -> Exported:
+    def export(self, parcel: Parcel) -> Exported:
         return {}
 
-    async def go_on(self) -> None:
-        self.steps.append("go on")
+    async def resume(self) -> None:
+        self.steps.append("resume")
 
-    def withdraw(self) -> None:
+    async def withdraw(self) -> None:
         pass
 
-    async def release(self) -> None:
-        self.steps.append("release")
+    async def detach(self) -> None:
+        self.steps.append("detach")
 
     async def run(self) -> None:
         try:
@@ -79,7 +80,7 @@ class PlayedSuccessor:
 def hq_only(successor: PlayedSuccessor) -> Restarts:
     """Make the restarts of a gateway with one listener."""
     made = plan({"robot": {"name": "r1"}, "hq": [{"protocol": "alf", "listen": "tcp://127.0.0.1:0"}]})
-    return Restarts(made, KeySpace("fleet", "r1"), None, successor)
+    return Restarts(made, KeySpace("fleet", "r1"), ColdStart(), successor)
 
 
 async def test_a_gateway_that_is_told_to_end_during_a_restart_takes_everything_back_before_its_parts_end() -> None:
@@ -94,7 +95,7 @@ async def test_a_gateway_that_is_told_to_end_during_a_restart_takes_everything_b
         await gateway
     await restarting
     await successor.task
-    assert part.steps == ["prepare", "hold", "go on", "ends"]
+    assert part.steps == ["prepare", "suspend", "resume", "ends"]
     assert not restarts.gone.is_set()
     with pytest.raises(NotReady, match="the gateway ends"):
         await restarts._restart()
@@ -107,7 +108,7 @@ async def test_a_robot_that_is_taken_while_the_successor_starts_is_stopped_and_h
     restarting = asyncio.ensure_future(restarts.restart())
     restarts.device = robot  # type: ignore[assignment]
     await successor.given.wait()
-    assert robot.steps == ["prepare", "hold"]
+    assert robot.steps == ["prepare", "suspend"]
     await restarts.settle()
     await restarting
     await successor.task
@@ -125,5 +126,5 @@ async def test_a_robot_that_is_taken_after_the_parts_were_stopped_refuses_the_re
     with pytest.raises(NotReady, match="the robot was taken"):
         await restarts._restart()
     assert robot.steps == []
-    assert part.steps == ["hold", "go on"]
+    assert part.steps == ["suspend", "resume"]
     await successor.task

@@ -22,8 +22,8 @@ from zbridge.bus.tls.files import (
 )
 from zbridge.errors import ConfigError
 from zbridge.security.certs import authority, x509
-from zbridge.security.certs.authority import CertificateRequest, load_certificate
-from zbridge.security.certs.files import Folder
+from zbridge.security.certs.authority import CertificateRequest
+from zbridge.security.files import Folder
 from zbridge.security.roles import Member
 
 NOW = datetime(2026, 11, 22, 12, 0, 0, tzinfo=UTC)
@@ -42,7 +42,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Folder:
 @pytest.mark.parametrize("name", ["hub", "g1"])
 def test_a_certificate_says_what_the_package_that_made_it_says(lab: Folder, name: str) -> None:
     file = lab.of(name).certificate
-    read, expected = read_certificate(file), load_certificate(file)
+    read, expected = read_certificate(file), x509.read_certificate(file)
     assert read.common_name == x509.common_name_of(expected)
     assert (read.begins, read.ends) == (expected.not_valid_before_utc, expected.not_valid_after_utc)
     assert f"{read.role}.{read.name}" == read.common_name

@@ -6,7 +6,7 @@ import pytest
 
 from tests.certificates import Authority
 from zbridge.bus import Tls
-from zbridge.bus.tls.member import own_name, own_role
+from zbridge.bus.tls.files import own_name, own_role
 from zbridge.errors import ConfigError
 
 

@@ -23,9 +23,9 @@ from typing import Any
 
 import zenoh
 
-from gateways.ros2.conformance.strict_robot import HASHES, RELIABLE, StrictRobot, config, gid_of
 from tests.e2e.conftest import HOST, Bench, configuration, device, until
 from tests.e2e.rigs.processes import Finding, report
+from tests.gateways.ros2.strict_robot import HASHES, RELIABLE, StrictRobot, config, gid_of
 from tests.ports import free_port
 
 LATE_S = 0.5

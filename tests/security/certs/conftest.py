@@ -9,7 +9,7 @@ import pytest
 
 from tests.security.certs.lab import Lab
 from zbridge.security.certs import authority
-from zbridge.security.certs.files import Folder
+from zbridge.security.files import Folder
 
 
 @pytest.fixture(autouse=True)

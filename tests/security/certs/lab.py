@@ -9,7 +9,7 @@ from cryptography.x509 import Certificate, load_pem_x509_certificate
 
 from zbridge.security.certs import authority
 from zbridge.security.certs.authority import CertificateRequest, Issued
-from zbridge.security.certs.files import Folder
+from zbridge.security.files import Folder
 from zbridge.security.roles import Member, Role
 
 

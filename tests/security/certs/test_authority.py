@@ -16,7 +16,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from tests.security.certs.lab import Lab
 from zbridge.errors import ConfigError
 from zbridge.security.certs import authority
-from zbridge.security.certs.files import changing
+from zbridge.security.files import changing
 from zbridge.security.roles import OF_ROBOTS, ROLES, Member, Role, Roles, load_roles, save_roles
 
 CLIENT, SERVER = ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH

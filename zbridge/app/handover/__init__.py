@@ -1,12 +1,12 @@
 """A restart that no robot notices: a gateway hands its connections and its state to a successor, and goes.
 
-``outgoing`` is the gateway that goes, ``incoming`` the one that comes; ``channel`` is the Unix socket between them and
-its messages, ``restarts`` what a gateway hands over and who may ask, ``processes`` how a successor is started and
+``sequence`` has both ends, the gateway that goes and the one that comes; ``channel`` is the Unix socket between them
+and its messages, ``restarts`` what a gateway hands over and who may ask, ``processes`` how a successor is started and
 ended. ``docs/architecture.md``, "A restart", has the sequence.
 """
 
-from zbridge.app.handover.incoming import Incoming
 from zbridge.app.handover.processes import Spawn, Successor
 from zbridge.app.handover.restarts import ClaimPart, Restarts
+from zbridge.app.handover.sequence import ColdStart, Incoming
 
-__all__ = ["ClaimPart", "Incoming", "Restarts", "Spawn", "Successor"]
+__all__ = ["ClaimPart", "ColdStart", "Incoming", "Restarts", "Spawn", "Successor"]

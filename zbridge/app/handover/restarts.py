@@ -13,9 +13,8 @@ import msgspec
 
 from zbridge.app.config import GatewayPlan
 from zbridge.app.handover.channel import VERSION, HandoverState
-from zbridge.app.handover.incoming import Incoming
-from zbridge.app.handover.outgoing import HandoverPart, Outgoing
 from zbridge.app.handover.processes import PROCESSES, Processes, Successor
+from zbridge.app.handover.sequence import Incoming, Outgoing
 from zbridge.bus import Bus, Handle, IncomingQuery
 from zbridge.control.admission import NameFilter
 from zbridge.control.latch_store import LatchStore
@@ -26,18 +25,19 @@ from zbridge.fleet.messages import Query
 from zbridge.fleet.topics import KeySpace
 from zbridge.protocol.kept import Budget, Exported
 from zbridge.robot.device import Device
-from zbridge.robot.ownership import CLAIM, Ownership
-from zbridge.transport import Parcel
+from zbridge.robot.ownership import Ownership
+from zbridge.transport import Parcel, Transferable
 from zbridge.transport.kernel import KERNEL, Kernel
 
 log = logging.getLogger("zbridge.app.handover")
 
 
-class ClaimPart:
-    """The claim of a gateway that owns its robot."""
+class ClaimPart(Transferable):
+    """The claim of a gateway that owns its robot, and the file of its latched stops, which the successor reads."""
 
-    def __init__(self, ownership: Ownership) -> None:
+    def __init__(self, ownership: Ownership, latches: LatchStore) -> None:
         self._ownership = ownership
+        self._latches = latches
         self._claim: Exported | None = None
         self._withdrawn = False
 
@@ -48,38 +48,35 @@ class ClaimPart:
         """Report the successor's claim as no rival's."""
         self._ownership.hands_over = True
 
-    async def shut(self) -> None:
-        """Do nothing."""
-
-    def hold(self) -> None:
-        """Do nothing."""
-
-    def hand_over(self, parcel: Parcel) -> Exported:
+    def export(self, parcel: Parcel) -> Exported:
         """Describe the claim; ``{}`` where the robot is not owned. One that was withdrawn is the successor's."""
         if not self._withdrawn:
             self._claim = self._ownership.export()
         return self._claim or {}
 
-    async def go_on(self) -> None:
-        """Claim the robot again, where the claim was withdrawn."""
-        self._ownership.hands_over = self._withdrawn = False
-        if self._claim is not None and self._ownership.export() is None:
-            self._ownership.inherit(self._claim)
-            self._ownership.begin()
+    async def restore(self, state: Exported, parcel: Parcel) -> None:
+        """Own the robot as the other process does, with a weak claim until :meth:`resume`."""
+        self._ownership.restore(state)
 
-    def withdraw(self) -> None:
-        """Leave the claim, and the liveliness token, to the successor's."""
+    async def resume(self) -> None:
+        """Own the robot: again, where the claim was withdrawn, or as the process before did, which has gone."""
+        if self._withdrawn and self._claim is not None:
+            self._ownership.restore(self._claim)
+        self._ownership.hands_over = self._withdrawn = False
+        self._ownership.begin()
+
+    async def withdraw(self) -> None:
+        """Leave the claim, and the liveliness token, to the successor's; wait until it can read the latched stops."""
         self._withdrawn = True
         self._ownership.release()
-
-    async def release(self) -> None:
-        """Do nothing: the claim is withdrawn."""
+        await self._latches.flush()
+        await self._ownership.drain()
 
 
 class Restarts:
     """The restarts of one gateway. The gateway enters its parts as it makes them.
 
-    incoming: where this gateway is a successor itself. successor: starts one; None: a restart is refused. clock:
+    incoming: what this gateway was handed itself. successor: starts one; None: a restart is refused. clock:
     seconds. processes, kernel: of this machine, or simulated ones.
     """
 
@@ -87,7 +84,7 @@ class Restarts:
         self,
         plan: GatewayPlan,
         keys: KeySpace,
-        incoming: Incoming | None,
+        incoming: Incoming,
         successor: Successor | None,
         clock: Callable[[], float] = time.monotonic,
         processes: Processes = PROCESSES,
@@ -96,11 +93,9 @@ class Restarts:
         self._clock = clock
         self._processes = processes
         self._kernel = kernel
-        self.bus: Bus | None = None
-        self.listeners: Sequence[HandoverPart] = ()
+        self.listeners: Sequence[Transferable] = ()
         self.device: Device | None = None
         self.claim: ClaimPart | None = None
-        self.latches: LatchStore | None = None
         self.metrics_sockets: list[socket.socket] = []
         self.gone = asyncio.Event()
         """Set when a successor serves everything: the gateway ends."""
@@ -110,8 +105,6 @@ class Restarts:
         self._successor = successor
         self._lock = asyncio.Lock()
         self._outgoing: Outgoing | None = None
-        self._handed_over: Device | None = None
-        """The device that the restart under way has stopped."""
         self._ends = False
         """Whether the gateway ends."""
         self._tasks: set[asyncio.Task[None]] = set()
@@ -138,8 +131,8 @@ class Restarts:
 
     def deposit(self, parcel: Parcel, budget: Budget) -> HandoverState | None:
         """Describe the robot's part as it is now, for a successor of a gateway that died; None where none can go on."""
-        device = self.device.keep(parcel, budget) if self.device is not None else None
-        claim = self.claim.hand_over(parcel) if self.claim is not None else None
+        device = self.device.deposit(parcel, budget) if self.device is not None else None
+        claim = self.claim.export(parcel) if self.claim is not None else None
         if device is None or not claim:
             return None
         return HandoverState(VERSION, self._plan.setup, len(parcel), claim=claim, device=device)
@@ -173,44 +166,28 @@ class Restarts:
             raise Unsupported("nothing starts a successor of this process")
         if self._plan.config.bus.listen:
             raise Unsupported("[bus] listen: two processes cannot listen at one endpoint; stop this one and start it")
-        successor_begins = self._incoming is not None and not self._incoming.begun.is_set()
-        if self._lock.locked() or self.gone.is_set() or successor_begins:
+        if self._lock.locked() or self.gone.is_set() or not self._incoming.begun.is_set():
             raise NotReady("a restart is under way")
         if self._ends:
             raise NotReady("the gateway ends")
         async with self._lock:
             began = self._clock()
             machine = (self._processes, self._kernel)
-            self._outgoing = Outgoing(self._successor, self._parts, self._describe, self._drain, *machine)
+            self._outgoing = Outgoing(self._successor, self._parts, self._describe, *machine)
             pid = await self._outgoing.run()
             log.info("handed over to process %d in %.0f ms", pid, (self._clock() - began) * 1000)
 
-    def _parts(self) -> list[HandoverPart]:
-        """Give what there is to hand over now."""
-        self._handed_over = self.device
+    def _parts(self) -> list[Transferable]:
         return [part for part in (*self.listeners, self.device, self.claim) if part is not None]
 
-    def _require_same_device(self) -> None:
-        """Raise Refused where the robot was taken, or left, since the parts were stopped."""
-        if self.device is not self._handed_over:
-            raise NotReady("the robot was taken, or left to another gateway, meanwhile: ask again")
-
-    async def _drain(self) -> None:
-        self._require_same_device()
-        if self.latches is not None:
-            await self.latches.flush()  # the successor reads them
-        if self.bus is not None and self.claim is not None:
-            await self.bus.drain(self._keys.key(CLAIM))  # the successor answers
-
     def _describe(self, parcel: Parcel) -> HandoverState:
-        self._require_same_device()
         state = HandoverState(
             VERSION,
             self._plan.setup,
             0,
-            claim=self.claim.hand_over(parcel) if self.claim is not None else None,
-            device=self.device.hand_over(parcel) if self.device is not None else None,
-            listeners=tuple(part.hand_over(parcel) for part in self.listeners),
+            claim=self.claim.export(parcel) if self.claim is not None else None,
+            device=self.device.export(parcel) if self.device is not None else None,
+            listeners=tuple(part.export(parcel) for part in self.listeners),
             metrics=tuple(parcel.put(sock.fileno()) for sock in self.metrics_sockets),
         )
         return msgspec.structs.replace(state, descriptors=len(parcel))

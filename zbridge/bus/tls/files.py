@@ -70,6 +70,21 @@ def own_certificate(tls: Tls | None) -> Certificate | None:
     return read_certificate(Path(tls.certificate)) if tls is not None and tls.certificate is not None else None
 
 
+def own_name(tls: Tls | None) -> str | None:
+    """Return the name in the common name ``role.name`` of our certificate, to which the router binds keys.
+
+    None where there is none of this form. Raises ConfigError if the certificate cannot be read.
+    """
+    certificate = own_certificate(tls)
+    return (certificate.name or None) if certificate is not None else None
+
+
+def own_role(tls: Tls | None) -> str | None:
+    """Return the role in that common name, as :func:`own_name` does."""
+    certificate = own_certificate(tls)
+    return (certificate.role or None) if certificate is not None else None
+
+
 def unusable(tls: Tls) -> str | None:
     """Say why no connection can be made with these files, whatever the time is; None where one can."""
     try:

@@ -16,19 +16,8 @@ from cryptography.x509 import Certificate
 
 from zbridge.errors import ConfigError
 from zbridge.security.certs import x509
-from zbridge.security.certs.files import (
-    PUBLIC,
-    SECRET,
-    Folder,
-    changing,
-    make_folder,
-    read,
-    read_secret,
-    refuse_to_overwrite,
-    write,
-)
+from zbridge.security.files import PUBLIC, SECRET, Folder, changing, make_folder, read, refuse_to_overwrite, write
 from zbridge.security.roles import ROLES, Member, Roles, check_member, check_name, load_roles, save_roles
-from zbridge.toml import prefixed
 
 AUTHORITY_DAYS = 3650
 DAYS = 365
@@ -37,16 +26,9 @@ SOON = timedelta(days=30)
 """How long before its end a certificate is due to be renewed."""
 
 
-def load_certificate(path: Path) -> Certificate:
-    """Read a certificate; raise ConfigError."""
-    content = read(path)
-    with prefixed(f"{path}: "):
-        return x509.read_certificate(content)
-
-
 def load_authority(folder: Folder, now: datetime) -> x509.CertificateAuthority:
     """Read the authority; raise ConfigError also if it has expired or its key is not its own."""
-    certificate = load_certificate(folder.ca)
+    certificate = x509.read_certificate(folder.ca)
     if certificate.not_valid_after_utc <= now:
         raise ConfigError(
             f"{folder.ca}: the authority expired on {certificate.not_valid_after_utc:%Y-%m-%d}; `zbridge certs init"
@@ -58,7 +40,7 @@ def load_authority(folder: Folder, now: datetime) -> x509.CertificateAuthority:
 def load_name(folder: Folder, name: str) -> tuple[EllipticCurvePrivateKey, Certificate]:
     """Read key and certificate of a name; raise ConfigError also if they do not match or others can read the key."""
     files = folder.of(name)
-    certificate = load_certificate(files.certificate)
+    certificate = x509.read_certificate(files.certificate)
     return _matching_key(files.key, certificate), certificate
 
 
@@ -76,10 +58,8 @@ def fault(certificate: Certificate, authority: Certificate, expected: str, now: 
 
 
 def _matching_key(path: Path, certificate: Certificate) -> EllipticCurvePrivateKey:
-    content = read_secret(path)
-    with prefixed(f"{path}: "):
-        key = x509.read_key(content)
-    if not x509.belongs_to(certificate, key):
+    key = x509.read_key(path)
+    if certificate.public_key() != key.public_key():
         raise ConfigError(f"{path}: not the key of the certificate {x509.common_name_of(certificate)!r} beside it")
     return key
 
@@ -220,7 +200,7 @@ def _write_certificate(folder: Folder, name: str, certificate: Certificate) -> N
 def _present(folder: Folder, name: str) -> Certificate | None:
     """Return the certificate that a name has; None if there is none, or none that can be read."""
     try:
-        return load_certificate(folder.of(name).certificate)
+        return x509.read_certificate(folder.of(name).certificate)
     except ConfigError:
         return None
 
@@ -245,7 +225,7 @@ class ListedCertificate(msgspec.Struct, frozen=True):
 def list_names(folder: Folder, now: datetime) -> list[ListedCertificate]:
     """Return every name in ``roles.toml``, then the revoked ones; raise ConfigError if there is no authority."""
     roles = load_roles(folder.roles)
-    authority = load_certificate(folder.ca)
+    authority = x509.read_certificate(folder.ca)
     known = [_entry(folder, authority, roles, name, now) for name in roles.names]
     return known + [ListedCertificate(name, problem="revoked") for name in roles.revoked]
 

@@ -11,8 +11,8 @@ import msgspec
 from zbridge.errors import ConfigError
 from zbridge.protocol.networks import is_loopback
 from zbridge.security.certs import x509
-from zbridge.security.certs.authority import check_known, fault, load_certificate, load_name
-from zbridge.security.certs.files import (
+from zbridge.security.certs.authority import check_known, fault, load_name
+from zbridge.security.files import (
     PUBLIC,
     SECRET,
     Folder,
@@ -24,6 +24,7 @@ from zbridge.security.certs.files import (
     write,
 )
 from zbridge.security.roles import Roles, load_roles
+from zbridge.toml import as_toml
 
 PORT = 7447
 """Where Zenoh routers listen."""
@@ -51,7 +52,7 @@ def bundle(folder: Folder, name: str, packing: Packing, now: datetime, *, force:
     roles = load_roles(folder.roles)
     check_known(folder, roles, name)
     _, certificate = load_name(folder, name)
-    if problem := fault(certificate, load_certificate(folder.ca), roles.common_name(name), now):
+    if problem := fault(certificate, x509.read_certificate(folder.ca), roles.common_name(name), now):
         raise ConfigError(f"{folder.of(name).certificate}: {problem}; `zbridge certs renew {name}`")
     files, packed = folder.of(name), NameFiles(packing.folder)
     if roles.names[name].role == "router":
@@ -78,8 +79,8 @@ def _bus(folder: Folder, roles: Roles, name: str, packing: Packing) -> str:
     paths = {"ca": there.ca, "certificate": there.certificate, "key": there.key}
     return _BUS.format(
         common_name=roles.common_name(name),
-        connect=", ".join(map(_quoted, endpoints)),
-        tls=", ".join(f"{key} = {_quoted(str(path))}" for key, path in paths.items()),
+        connect=as_toml(endpoints),
+        tls=", ".join(f"{key} = {as_toml(str(path))}" for key, path in paths.items()),
     )
 
 
@@ -97,16 +98,11 @@ def _routers(folder: Folder, roles: Roles) -> tuple[str, ...]:
     return tuple(endpoints)
 
 
-def _quoted(text: str) -> str:
-    """Write a string in TOML; JSON's escapes are TOML's."""
-    return msgspec.json.encode(text).decode()
-
-
 _BUS = """\
 # [bus] of a gateway or listener that joins the bus as {common_name}: put it into the configuration.
 [bus]
 mode = "client"
 multicast = false
-connect = [{connect}]
+connect = {connect}
 tls = {{ {tls} }}
 """

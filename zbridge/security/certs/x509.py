@@ -11,6 +11,7 @@ from __future__ import annotations
 import ipaddress
 import re
 from datetime import datetime, timedelta
+from pathlib import Path
 
 import msgspec
 from cryptography import x509
@@ -22,15 +23,11 @@ from cryptography.hazmat.primitives.asymmetric.ec import (
     EllipticCurvePublicKey,
     generate_private_key,
 )
-from cryptography.hazmat.primitives.serialization import (
-    Encoding,
-    NoEncryption,
-    PrivateFormat,
-    load_pem_private_key,
-)
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, load_pem_private_key
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from zbridge.errors import ConfigError
+from zbridge.security.files import read, read_secret
 
 EARLIER = timedelta(hours=1)
 """How long before now a certificate begins: the clock of another machine may be slow."""
@@ -103,22 +100,22 @@ def is_reachable(host: str) -> bool:
     return ":" not in host
 
 
-def read_certificate(pem: bytes) -> x509.Certificate:
-    """Read a certificate; raise ConfigError."""
+def read_certificate(path: Path) -> x509.Certificate:
+    """Read a certificate; raise ConfigError, which names the file."""
     try:
-        return x509.load_pem_x509_certificate(pem)
+        return x509.load_pem_x509_certificate(read(path))
     except ValueError as error:
-        raise ConfigError("not a certificate in PEM form") from error
+        raise ConfigError(f"{path}: not a certificate in PEM form") from error
 
 
-def read_key(pem: bytes) -> EllipticCurvePrivateKey:
-    """Read a private key; raise ConfigError."""
+def read_key(path: Path) -> EllipticCurvePrivateKey:
+    """Read a private key; raise ConfigError, which names the file, also if others can read or write it."""
     try:
-        key = load_pem_private_key(pem, password=None)
+        key = load_pem_private_key(read_secret(path), password=None)
     except (ValueError, TypeError) as error:  # TypeError: a password protects the key
-        raise ConfigError("not a private key in PEM form without a password") from error
+        raise ConfigError(f"{path}: not a private key in PEM form without a password") from error
     if not isinstance(key, EllipticCurvePrivateKey):
-        raise ConfigError("not an ECDSA key")
+        raise ConfigError(f"{path}: not an ECDSA key")
     return key
 
 
@@ -150,11 +147,6 @@ def hosts_of(certificate: x509.Certificate) -> tuple[str, ...]:
 def fingerprint(certificate: x509.Certificate) -> str:
     """Return the SHA-256 fingerprint as openssl prints it: ``3F:A2:...``."""
     return certificate.fingerprint(hashes.SHA256()).hex(":").upper()
-
-
-def belongs_to(certificate: x509.Certificate, key: EllipticCurvePrivateKey) -> bool:
-    """Tell whether a certificate is for this key."""
-    return certificate.public_key() == key.public_key()
 
 
 def issued_by(certificate: x509.Certificate, authority: x509.Certificate) -> bool:

@@ -8,7 +8,7 @@ import logging
 from collections.abc import Callable
 
 from zbridge.bus import Bus, BusSettings, open_bus
-from zbridge.bus.tls.member import own_name
+from zbridge.bus.tls.files import own_name
 from zbridge.errors import BusError, ConfigError
 from zbridge.fleet.topics import KeySpace
 from zbridge.metrics import Metrics

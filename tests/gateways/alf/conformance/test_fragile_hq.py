@@ -205,11 +205,11 @@ def test_it_is_no_other_hq_and_sends_nothing_that_none_sends() -> None:
             hq.drive(*command)
 
 
-async def test_lists_are_bounded_and_every_violation_is_told() -> None:
-    told: list[str] = []
-    hq = await played(
-        viewer(keep=3, note=told.append), "say " + "3|1;" * 10, "> INFO INFO INFO INFO END", "close", "over"
-    )
+async def test_lists_are_bounded_and_every_violation_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(FragileAlfHq, "KEEP", 3)
+    hq, told = viewer(), list[str]()
+    hq.note = told.append
+    await played(hq, "say " + "3|1;" * 10, "> INFO INFO INFO INFO END", "close", "over")
     assert (len(hq.violations), len(hq.received), len(hq.infos), len(told)) == (3, 3, 3, 10)
 
 

@@ -71,14 +71,14 @@ UNKNOWN = ", of which this server knows nothing"
     ],
 )
 def test_what_is_wrong_in_a_message_is_told_and_whether_it_kills_a_vehicle(data: bytes, problem: str) -> None:
-    (heard,) = parser.reader("text" if data[-1:] in b";|" else "binary", {3, 255}, 100).take(data)
+    (heard,) = parser.CommandReader("text" if data[-1:] in b";|" else "binary", {3, 255}).take(data)
     assert (heard.deadly, heard.problem) == (problem.startswith("deadly: "), problem.removeprefix("deadly: "))
 
 
-def test_full_speed_is_a_setting_and_a_laser_knows_no_commands() -> None:
-    fast, laser = parser.reader("text", {3, 255}, 255), parser.reader("text", {255}, 100)
-    told = [one.problem for one in fast.take(b"3|255|0|0|0;3|256|0|0|0;") + laser.take(b"3|0|0|0|0;")]
-    assert told == ["", "speed 256 instead of 0..255", f"id 3{UNKNOWN}"]
+def test_full_speed_is_a_hundred_and_a_laser_knows_no_commands() -> None:
+    drive, laser = parser.CommandReader("text", {3, 255}), parser.CommandReader("text", {255})
+    told = [one.problem for one in drive.take(b"3|100|0|0|0;3|101|0|0|0;") + laser.take(b"3|0|0|0|0;")]
+    assert told == ["", "speed 101 instead of 0..100", f"id 3{UNKNOWN}"]
 
 
 @pytest.mark.parametrize("dialect", DIALECTS)
@@ -86,14 +86,14 @@ def test_the_cut_does_not_depend_on_the_reads_and_random_bytes_never_make_the_ju
     messages = [MESSAGES[name][dialect] for name in ("GOOD", "FORWARD", "END")]
     data = b"".join(messages)
     for size in range(1, len(data)):
-        reader = parser.reader(dialect, {3, 255}, 100)
+        reader = parser.CommandReader(dialect, {3, 255})
         heard = [one for at in range(0, len(data), size) for one in reader.take(data[at : at + size])]
         assert [one.raw for one in heard] == messages
         assert not any(one.problem for one in heard)
         assert reader.rest == b""
     rng = random.Random(5)
     for _ in range(300):
-        reader = parser.reader(dialect, {3, 255}, 100)
+        reader = parser.CommandReader(dialect, {3, 255})
         assert all(one.raw for one in reader.take(bytes(rng.choices(b"0123459|;.-\xff\x03", k=60))))
 
 
@@ -118,7 +118,7 @@ def test_a_rhythm_that_is_too_slow_is_noted(times: AlfTimes, commands: list[int]
 
 
 def test_the_recorded_hq_is_not_reproached() -> None:
-    reader, repeats = parser.reader("text", {3, 255}, 100), Repeats(AlfTimes())
+    reader, repeats = parser.CommandReader("text", {3, 255}), Repeats(AlfTimes())
     records = payloads("alf-drive.hex", destination=16668)
     heard = [(record.seconds, one.problem) for record in records for one in reader.take(record.payload)]
     assert [problem for _, problem in heard] == [""] * 115
@@ -301,9 +301,12 @@ async def test_an_end_goes_behind_a_measurement_that_is_being_sent_and_none_wher
     assert (len(said) == size, said.endswith(b"\xff\x01")) == (ended, ended)
 
 
-async def test_what_is_kept_is_bounded_and_nothing_is_ended_before_anybody_came() -> None:
-    noted: list[str] = []
-    vehicle = quick(keep=2, note=noted.append)
+async def test_what_is_kept_is_bounded_and_nothing_is_ended_before_anybody_came(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(FragileVehicle, "KEEP", 2)
+    vehicle, noted = quick(), list[str]()
+    vehicle.note = noted.append
     await vehicle.end()
     async with connected(vehicle) as hq:
         await hq.say("7;8;9;3|0|0|0|0;")
@@ -332,8 +335,8 @@ async def test_neither_judge_finds_fault_with_the_other(dialect: Dialect) -> Non
     assert [fields[0] for _, fields in scans] == list(range(hq.scans))
     assert scans[10][0] - scans[0][0] > 0.7, "ten a second"
     assert scans[-1][1][2:] == (44, 725)
-    assert all(0 <= point <= 5600 for point in hq.last_scan.points)
-    assert any(point >= 20 for point in hq.last_scan.points[44:726])
+    assert all(0 <= point <= 5600 for point in hq.last_points)
+    assert any(point >= 20 for point in hq.last_points[44:726])
     assert hq.infos[0][:7] == (0, 0, 0, one_g, 0, 0, 0)
     speed, _, to_the_right, _, _, _, turn, _ = hq.infos[1]
     assert (speed > 50, to_the_right > 0, turn < 0, vehicle.machine.light) == (True, True, True, True)
@@ -349,7 +352,7 @@ async def simulating(servers: int, dialect: Dialect = "text") -> list[Hq]:
     bound: asyncio.Future[tuple[Address, ...]] = asyncio.get_running_loop().create_future()
     simulation = Simulation((Address("127.0.0.1", 0),) * servers, ready=bound.set_result)
     first, *others = fragile_vehicle(dialect, servers=servers, seed=3, times=QUICK)
-    task = asyncio.create_task(first.simulate(simulation, *others))
+    task = asyncio.create_task(first.simulate(simulation.addresses, simulation.ready, *others))
     scenes = [Hq(None, Peer(address.port), task) for address in await bound]
     for scene in scenes:
         await scene.connect("")

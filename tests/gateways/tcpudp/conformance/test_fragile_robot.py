@@ -15,7 +15,7 @@ from gateways.tcpudp.conformance.fragile_robot import FragileRobot
 from gateways.tcpudp.conformance.machine import Loss, Quirks
 from gateways.tcpudp.conformance.parser import FeatureFlag, RobotTimes
 from tests import captures
-from tests.conformance.scene import LONG_S, Peer, serving, table, until
+from tests.conformance.scene import LONG_S, Peer, bounded, serving, table, until
 from tests.gateways.tcpudp.conformance.udp_scene import NAMES as SHARED
 from tests.gateways.tcpudp.conformance.udp_scene import UdpScene
 from zbridge.protocol import Address, Simulation
@@ -123,7 +123,7 @@ async def facing(robot: FragileRobot) -> AsyncIterator[Hq]:
 def quick(version: str = "1.3", udp: bool = False, **options: Any) -> FragileRobot:
     options = {"client_id": CLIENT, "times": QUICK, **options}
     quirks = Quirks(**{name: options.pop(name) for name in Quirks.__struct_fields__ if name in options})
-    return FragileRobot(version=version, udp=udp, seed=1, quirks=quirks, **options)
+    return bounded(FragileRobot, {"version": version, "udp": udp, "seed": 1, "quirks": quirks, **options})
 
 
 ROBOTS: dict[str, dict[str, Any]] = {
@@ -377,7 +377,9 @@ async def test_a_datagram_from_another_socket_is_noted() -> None:
 async def test_the_simulator_logs_violations_and_says_what_it_died_of(caplog, capsys) -> None:
     bound: asyncio.Future[tuple[Address, ...]] = asyncio.get_running_loop().create_future()
     simulation = Simulation((Address("127.0.0.1", 0),), ready=bound.set_result)
-    task = asyncio.create_task(FragileRobot(version="1.3", udp=False, seed=3).simulate(simulation))
+    task = asyncio.create_task(
+        FragileRobot(version="1.3", udp=False, seed=3).simulate(simulation.addresses, simulation.ready)
+    )
     hq = Hq(None, Peer((await bound)[0].port), task)
     with contextlib.closing(hq.peer), contextlib.closing(hq.udp):
         await hq.connect("")

@@ -10,7 +10,7 @@ import pytest
 
 from gateways.wc2ec.conformance.fragile_hq import FragileExternalController
 from tests.captures import stream
-from tests.conformance.scene import LONG_S, Listening, Scene, calling, table, until
+from tests.conformance.scene import LONG_S, Listening, Scene, bounded, calling, table, until
 
 NAMES = {
     "WHEEL1": "00 35 00 06 77 68 65 65 6c 31",
@@ -134,7 +134,7 @@ async def facing(controller: FragileExternalController) -> AsyncIterator[Talk]:
     },
 )
 async def test_what_a_webots_controller_may_do_and_what_not(options: dict[str, Any], steps: list[str]) -> None:
-    async with facing(FragileExternalController(**options)) as talk:
+    async with facing(bounded(FragileExternalController, options)) as talk:
         await talk.play(steps)
 
 

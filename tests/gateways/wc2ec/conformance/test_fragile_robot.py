@@ -15,8 +15,8 @@ import pytest
 from gateways.wc2ec.conformance.fragile_robot import FragileWebotsController
 from gateways.wc2ec.conformance.machine import JudgedWebots
 from gateways.wc2ec.conformance.parser import DEFAULT, DeviceKind, Dialect, ExternalReader, SimulatedDevice, Wc2EcTimes
-from tests.conformance.scene import LONG_S, Peer, Scene, serving, table, until
-from zbridge.protocol import Address, Simulation
+from tests.conformance.scene import LONG_S, Peer, Scene, bounded, serving, table, until
+from zbridge.protocol import Address
 
 QUICK = Wc2EcTimes(step_s=0.005, register_s=0.0, part_s=5)
 """As quick as a test, and patient where patience is not what it is about."""
@@ -120,7 +120,7 @@ async def facing(controller: FragileWebotsController) -> AsyncIterator[Talk]:
 
 
 def quick(dialect: Dialect = "deployed", **options: Any) -> FragileWebotsController:
-    return FragileWebotsController(dialect, **{"times": QUICK, **options})
+    return bounded(FragileWebotsController, {"dialect": dialect, "times": QUICK, **options})
 
 
 JUDGES: dict[str, dict[str, Any]] = {
@@ -275,8 +275,8 @@ def test_it_drives_as_its_wheels_turn_and_sees_the_wall_that_it_nears(left: floa
 async def test_the_program_ends_with_its_external_controller_and_says_why(capsys, caplog) -> None:
     for said, words in (("", "the external controller left the robot at rest: closed"), ("ENABLE 84", "died: unknown")):
         bound: asyncio.Future[tuple[Address, ...]] = asyncio.get_running_loop().create_future()
-        simulation = Simulation((Address("127.0.0.1", 0),), ready=bound.set_result)
-        task = asyncio.create_task(FragileWebotsController("draft", seed=3, times=QUICK).simulate(simulation))
+        controller = FragileWebotsController("draft", seed=3, times=QUICK)
+        task = asyncio.create_task(controller.simulate((Address("127.0.0.1", 0),), bound.set_result))
         talk = Talk(None, External((await bound)[0].port), task)
         with contextlib.closing(talk.peer):
             await talk.play(["connect", f"> {said}", "shut", "over"])

@@ -1,4 +1,4 @@
-"""The files of an authority: where each is, written whole or not at all; keys for their owner alone."""
+"""The files of a secure bus: where each is, written whole or not at all; keys for their owner alone."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-import msgspec
-
 from zbridge.errors import ConfigError
 
 SECRET, PUBLIC, PRIVATE_FOLDER = 0o600, 0o644, 0o700
@@ -17,46 +15,25 @@ _OTHERS = 0o077
 """The permissions of everybody but the owner."""
 
 
-class NameFiles(msgspec.Struct, frozen=True):
+class NameFiles:
     """The files of one name; a folder that holds them is what ``--tls`` takes."""
 
-    folder: Path
-
-    @property
-    def ca(self) -> Path:
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.ca = folder / "ca.pem"
         """The certificate of the authority."""
-        return self.folder / "ca.pem"
-
-    @property
-    def certificate(self) -> Path:
-        """The certificate of the name."""
-        return self.folder / "certificate.pem"
-
-    @property
-    def key(self) -> Path:
-        """The private key of the name."""
-        return self.folder / "key.pem"
+        self.certificate = folder / "certificate.pem"
+        self.key = folder / "key.pem"
 
 
-class Folder(msgspec.Struct, frozen=True):
+class Folder:
     """The folder of an authority."""
 
-    path: Path
-
-    @property
-    def ca(self) -> Path:
-        """The certificate of the authority."""
-        return self.path / "ca.pem"
-
-    @property
-    def ca_key(self) -> Path:
-        """The private key of the authority."""
-        return self.path / "ca-key.pem"
-
-    @property
-    def roles(self) -> Path:
-        """``roles.toml``."""
-        return self.path / "roles.toml"
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.ca = path / "ca.pem"
+        self.ca_key = path / "ca-key.pem"
+        self.roles = path / "roles.toml"
 
     def of(self, name: str) -> NameFiles:
         """Return the files of a name. A name has no dots, so no name is one of the files above."""
@@ -85,14 +62,18 @@ def make_folder(path: Path) -> None:
         path.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
 
 
-def write(path: Path, content: bytes, mode: int) -> None:
-    """Replace a file as a whole; raise ConfigError. A secret is never readable by others, not even meanwhile."""
+def write(path: Path, content: bytes, mode: int | None = None) -> None:
+    """Replace a file as a whole; raise ConfigError. A secret is never readable by others, not even meanwhile.
+
+    mode: None: as the umask has it.
+    """
     new = path.with_name(f".{path.name}.new")
     with _named(path):
         new.unlink(missing_ok=True)
-        descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+        descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666 if mode is None else mode)
         with os.fdopen(descriptor, "wb") as file:
-            os.fchmod(descriptor, mode)  # whatever the umask is
+            if mode is not None:
+                os.fchmod(descriptor, mode)  # whatever the umask is
             file.write(content)
             file.flush()
             os.fsync(descriptor)

@@ -21,7 +21,6 @@ from zbridge.app.config import plan
 from zbridge.app.gateway import Gateway
 from zbridge.app.handover.channel import VERSION, HandoverState
 from zbridge.app.joining import RETRY_S, join_bus
-from zbridge.app.tasks import until_signal
 from zbridge.bus import Bus, Handle
 from zbridge.bus.fake import FakeBus
 from zbridge.control.latch_store import LatchStore
@@ -29,6 +28,7 @@ from zbridge.errors import BusError, ConfigError
 from zbridge.fleet.topics import KeySpace
 from zbridge.hq import RobotSubscription
 from zbridge.metrics import Metrics
+from zbridge.tasks import until_signal
 
 SOON_S = 5.0
 NOWHERE = {"protocol": "tcpudp", "connect": ["tcp://127.0.0.1:1"]}

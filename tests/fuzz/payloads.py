@@ -16,6 +16,7 @@ from zbridge.control.latch import STOPS, Latches, LatchRecord, latch_of, read_st
 from zbridge.errors import LinkError, Malformed, PayloadError, ProtocolError, Unsupported
 from zbridge.fleet import messages, payload, topics
 from zbridge.fleet.messages import Authorization, FleetMessage, Stop
+from zbridge.fleet.payload import with_stamp
 from zbridge.host import fd_channel as supervisor
 from zbridge.lease.proof import Verifier, read
 from zbridge.protocol.address import Address, parse_device_address
@@ -29,7 +30,6 @@ from zbridge.views.foxglove.requests import read_twist as read_json_twist
 from zbridge.views.ros2.cmd_vel import STAMPED, TWIST
 from zbridge.views.ros2.cmd_vel import read_twist as read_cdr_twist
 from zbridge.views.ros2.settings import RobotBody
-from zbridge.views.stamps import with_stamp
 
 KINDS = sorted(
     (kind for kind in vars(messages).values() if isinstance(kind, type) and issubclass(kind, FleetMessage)),
@@ -171,7 +171,7 @@ def require_drivable(drive: messages.Drive) -> None:
 
 def targets() -> Iterator[Target]:
     """Yield the targets."""
-    yield Target("fleet-payload", read_fleet, _fleet, ("zbridge/fleet/payload.py", "zbridge/views/stamps.py"))
+    yield Target("fleet-payload", read_fleet, _fleet, ("zbridge/fleet/payload.py",))
     yield Target("authorization", read_authorization, _authorizations, (), 256)
     yield Target("stop", read_stops, _stops, ("zbridge/control/latch.py",), 512)
     yield Target("claim", read_claim, _claims, ())

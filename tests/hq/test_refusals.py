@@ -16,8 +16,8 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import TOLD
 from zbridge.fleet.topics import KeySpace
 from zbridge.hq.refusals import EVERY_S, RefusalReports
-from zbridge.hq.tasks import Tasks
 from zbridge.metrics import Metrics
+from zbridge.tasks import Tasks
 
 pytestmark = pytest.mark.jumping
 

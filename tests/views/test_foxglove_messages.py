@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from tests.views.protobuf import read
-from zbridge.fleet.messages import Map, Pose, Scan
-from zbridge.views import foxglove_messages
+from zbridge.fleet.messages import Image, Map, Pose, Scan
+from zbridge.views import pictures
 from zbridge.views.schemas import foxglove_schema
 
 STAMP_NS = 1_700_000_000_000_000_007
@@ -41,11 +41,11 @@ def as_the_sdk(message: Scan, frame: str, stamp_ns: int) -> bytes:
 @pytest.mark.parametrize("stamp_ns", [STAMP_NS, 1_000_000_001, 2**32 * 10**9 - 1])
 def test_a_scan_is_encoded_byte_for_byte_as_the_sdk_encodes_it(points: int, stamp_ns: int) -> None:
     message = scan(np.linspace(0.5, 12, points))
-    assert foxglove_messages.laser_scan(message, "r1/scan", stamp_ns) == as_the_sdk(message, "r1/scan", stamp_ns)
+    assert pictures.laser_scan(message, "r1/scan", stamp_ns) == as_the_sdk(message, "r1/scan", stamp_ns)
 
 
 def test_a_scan_has_the_angles_of_its_first_and_last_point_and_nan_where_it_saw_nothing() -> None:
-    payload = foxglove_messages.laser_scan(scan([1.0, math.nan, 2.5]), "r1/scan", STAMP_NS)
+    payload = pictures.laser_scan(scan([1.0, math.nan, 2.5]), "r1/scan", STAMP_NS)
     fields = read(foxglove_schema("LaserScan"), payload)
     assert fields["ranges"] == [1.0, "NaN", 2.5]
     assert (fields["timestamp"], fields["frame_id"]) == (STAMP, "r1/scan")
@@ -54,13 +54,13 @@ def test_a_scan_has_the_angles_of_its_first_and_last_point_and_nan_where_it_saw_
 
 
 def test_a_scan_without_points_and_at_zero_can_be_read() -> None:
-    fields = read(foxglove_schema("LaserScan"), foxglove_messages.laser_scan(scan([], 0.0), "r1/scan", 0))
+    fields = read(foxglove_schema("LaserScan"), pictures.laser_scan(scan([], 0.0), "r1/scan", 0))
     assert (fields["ranges"], fields["start_angle"], fields["end_angle"]) == ([], 0.0, 0.0)
     assert fields["timestamp"] == "1970-01-01T00:00:00Z"
 
 
 def test_a_pose_turns_counter_clockwise_about_the_vertical() -> None:
-    payload = foxglove_messages.pose_in_frame(Pose(1.5, -2.0, math.pi / 2), "r1/map", STAMP_NS)
+    payload = pictures.pose_in_frame(Pose(1.5, -2.0, math.pi / 2), "r1/map", STAMP_NS)
     fields = read(foxglove_schema("PoseInFrame"), payload)
     assert (fields["timestamp"], fields["frame_id"]) == (STAMP, "r1/map")
     assert fields["pose"]["position"] == {"x": 1.5, "y": -2.0, "z": 0.0}
@@ -70,7 +70,7 @@ def test_a_pose_turns_counter_clockwise_about_the_vertical() -> None:
 
 def test_frames_lead_from_parent_to_child() -> None:
     placed = (("r1/map", "r1/base", Pose(1.0, 2.0, math.pi)), ("r1/base", "r1/scan", None))
-    fields = read(foxglove_schema("FrameTransforms"), foxglove_messages.transforms(placed, STAMP_NS))
+    fields = read(foxglove_schema("FrameTransforms"), pictures.transforms(placed, STAMP_NS))
     base, scanner = fields["transforms"]
     assert (base["parent_frame_id"], base["child_frame_id"], base["timestamp"]) == ("r1/map", "r1/base", STAMP)
     assert base["translation"] == {"x": 1.0, "y": 2.0, "z": 0.0}
@@ -83,7 +83,7 @@ def test_frames_lead_from_parent_to_child() -> None:
 def test_a_map_is_a_grid_of_colours_with_its_first_cell_at_the_origin() -> None:
     cells = np.array([[0, 1, 2], [2, 1, 77]], np.uint8)
     message = Map(rows=2, columns=3, cell=0.05, origin=(-1.0, -2.0), cells=cells)
-    fields = read(foxglove_schema("Grid"), foxglove_messages.grid(message, "r1/map", STAMP_NS))
+    fields = read(foxglove_schema("Grid"), pictures.grid(message, "r1/map", STAMP_NS))
     assert (fields["frame_id"], fields["timestamp"]) == ("r1/map", STAMP)
     assert fields["pose"]["position"] == {"x": -1.0, "y": -2.0, "z": -0.02}
     assert (fields["column_count"], fields["row_stride"], fields["cell_stride"]) == (3, 12, 4)
@@ -100,7 +100,7 @@ def test_a_map_is_a_grid_of_colours_with_its_first_cell_at_the_origin() -> None:
 
 
 def test_a_log_tells_who_said_it_and_how_bad_it_is() -> None:
-    fields = read(foxglove_schema("Log"), foxglove_messages.log("döor open", fox.LogLevel.Warning, "r1", STAMP_NS))
+    fields = read(foxglove_schema("Log"), pictures.log("döor open", fox.LogLevel.Warning, "r1", STAMP_NS))
     assert (fields["message"], fields["level"], fields["name"], fields["timestamp"]) == (
         "döor open",
         "WARNING",
@@ -110,14 +110,15 @@ def test_a_log_tells_who_said_it_and_how_bad_it_is() -> None:
 
 
 def test_an_image_keeps_its_bytes() -> None:
-    payload = foxglove_messages.compressed_image(b"\xff\xd8jpeg", "jpeg", "r1/camera", STAMP_NS)
+    image = Image(format="jpeg", data=b"\xff\xd8jpeg")
+    payload = pictures.compressed_image(image, "r1/camera", STAMP_NS)
     fields = read(foxglove_schema("CompressedImage"), payload)
     assert base64.b64decode(fields["data"]) == b"\xff\xd8jpeg"
     assert (fields["format"], fields["frame_id"], fields["timestamp"]) == ("jpeg", "r1/camera", STAMP)
 
 
 def test_a_trail_is_one_line_that_replaces_the_one_before() -> None:
-    fields = read(foxglove_schema("SceneUpdate"), foxglove_messages.trail([(0.0, 1.0), (2.0, 3.0)], "r1/map", STAMP_NS))
+    fields = read(foxglove_schema("SceneUpdate"), pictures.trail([(0.0, 1.0), (2.0, 3.0)], "r1/map", STAMP_NS))
     (entity,) = fields["entities"]
     assert (entity["id"], entity["frame_id"]) == ("trail", "r1/map")
     (line,) = entity["lines"]

@@ -6,10 +6,9 @@ import pytest
 
 from zbridge.bus.fake import FakeBus
 from zbridge.fleet.messages import Switch
-from zbridge.fleet.payload import encode
+from zbridge.fleet.payload import encode, measured_ns
 from zbridge.metrics import Metrics
 from zbridge.views.live_robots import OnDemandSubscriptions, read_payload, watch_robots
-from zbridge.views.stamps import measured_ns
 
 
 @pytest.mark.parametrize(("watched", "expected"), [((), ["r1", "r2"]), (("r2",), ["r2"])])

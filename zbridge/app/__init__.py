@@ -5,7 +5,7 @@ Puts the rooms below together. Knows no protocol (entry points find them), no te
 
 from zbridge.app.config import GatewayPlan, load, plan
 from zbridge.app.gateway import Gateway
-from zbridge.app.tasks import until_signal
 from zbridge.app.templates import listener_template, robot_template
+from zbridge.tasks import until_signal
 
 __all__ = ["Gateway", "GatewayPlan", "listener_template", "load", "plan", "robot_template", "until_signal"]

@@ -24,7 +24,6 @@ from zbridge.app.joining import SessionUseless, watch_certificate, watch_session
 from zbridge.app.prometheus import serve_metrics
 from zbridge.app.runtime import RUNTIME, Runtime, open_audit
 from zbridge.app.serving import SERVED_ELSEWHERE, Begin, Serving
-from zbridge.app.tasks import together, until
 from zbridge.bus import Bus, Handle, IncomingQuery
 from zbridge.bus.tls.files import own_certificate, own_name
 from zbridge.control.audit_log import Audit
@@ -47,6 +46,7 @@ from zbridge.robot.device import Device
 from zbridge.robot.observer import Observer
 from zbridge.robot.ownership import Ownership
 from zbridge.robot.settings import DevicePlan
+from zbridge.tasks import together, until
 from zbridge.transport import Parcel, attach, connect
 from zbridge.transport.fair_share import FairShare
 

@@ -14,16 +14,10 @@ import msgspec
 
 from zbridge.bus.interface import Answer, Batch, Handle, IncomingQuery, Lane, Publisher, Sample, Sort
 from zbridge.errors import Refused
-from zbridge.fleet.topics import Topic, is_concrete
+from zbridge.fleet.topics import Topic, is_concrete, matches
 from zbridge.metrics import Metrics
 
 H = TypeVar("H", bound=Handle)
-
-
-@lru_cache(maxsize=65536)
-def matches(key_expr: str, key: str) -> bool:
-    """Tell whether a key expression matches a key; chunks that begin with ``@`` only match an equal chunk."""
-    return _match(key_expr.split("/"), key.split("/"))
 
 
 @lru_cache(maxsize=65536)
@@ -41,20 +35,6 @@ def _meet(one: list[str], other: list[str]) -> bool:
         return _meet(one[1:], other) or (not other[0].startswith("@") and _meet(one, other[1:]))
     wild = "*" in (one[0], other[0]) and "@" not in (one[0][:1], other[0][:1])
     return (wild or one[0] == other[0]) and _meet(one[1:], other[1:])
-
-
-def _match(expression: list[str], chunks: list[str]) -> bool:
-    if not expression:
-        return not chunks
-    head, rest = expression[0], expression[1:]
-    if head == "**":
-        if _match(rest, chunks):
-            return True
-        return bool(chunks) and not chunks[0].startswith("@") and _match(expression, chunks[1:])
-    if not chunks:
-        return False
-    wild = head == "*" and not chunks[0].startswith("@")
-    return (wild or head == chunks[0]) and _match(rest, chunks[1:])
 
 
 class FakeBus:

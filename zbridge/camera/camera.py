@@ -27,6 +27,7 @@ from zbridge.fleet.messages import Image
 from zbridge.fleet.topics import KeySpace
 from zbridge.metrics import Metrics
 from zbridge.protocol.session_table import Backoff
+from zbridge.tasks import race
 
 log = logging.getLogger("zbridge.camera")
 
@@ -75,7 +76,6 @@ class Camera:
         return f"<Camera {self._plan.source} {self.demand!r}>"
 
     async def run(self) -> None:
-        """Serve the camera until cancelled."""
         watch = self._bus.watch_listeners(self._key, self.demand.listen)
         try:
             async with asyncio.TaskGroup() as tasks:
@@ -113,19 +113,14 @@ class Camera:
     async def _fetch(self) -> str | None:
         """Fetch until the stream ends; return why it ended. None: nobody watches any more."""
         log.info("camera %s: connecting", self._plan.source)
-        fetching = asyncio.create_task(fetch(self._plan.source, self._plan.settings.stall_s, self._receive))
-        idle = asyncio.create_task(self.demand.end())
         try:
-            await asyncio.wait((fetching, idle), return_when=asyncio.FIRST_COMPLETED)
-            error = fetching.exception() if fetching.done() else None
-        finally:
-            for task in (fetching, idle):
-                task.cancel()
-            await asyncio.gather(fetching, idle, return_exceptions=True)
-        if error is None or isinstance(error, LinkError | ProtocolError):
-            return str(error) if error is not None else None
-        log.error("camera %s: %s", self._plan.source, describe(error), exc_info=error)
-        return describe(error)
+            await race(fetch(self._plan.source, self._plan.settings.stall_s, self._receive), self.demand.end())
+        except (LinkError, ProtocolError) as error:
+            return str(error)
+        except Exception as error:
+            log.error("camera %s: %s", self._plan.source, describe(error), exc_info=error)
+            return describe(error)
+        return None
 
     def _receive(self, stream: MjpegReader, parts: list[MjpegPart]) -> None:
         """Take the parts of one read, of which the newest counts."""

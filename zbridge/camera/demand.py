@@ -16,14 +16,15 @@ class Demand:
         """Whether a program on the bus listens to the images."""
         self.clients = 0
         """Clients of the relay that get the stream."""
-        self._changed = asyncio.Event()
+        self._begun, self._ended = asyncio.Event(), asyncio.Event()
+        """Set while anybody watches, and while nobody does."""
+        self._ended.set()
 
     def __repr__(self) -> str:
         return f"<Demand {'bus' if self.listened else 'no bus'}, {self.clients} clients>"
 
     @property
     def wanted(self) -> bool:
-        """Whether anybody watches."""
         return self.listened or self.clients > 0
 
     def listen(self, anybody: bool) -> None:
@@ -44,13 +45,12 @@ class Demand:
     async def begin(self) -> None:
         """Wait until somebody watches."""
         while not self.wanted:
-            await self._change()
+            await self._begun.wait()
 
     async def end(self) -> None:
         """Wait until nobody has watched for :data:`LINGER_S`."""
         while True:
-            while self.wanted:
-                await self._change()
+            await self._ended.wait()
             try:
                 async with asyncio.timeout(LINGER_S):
                     await self.begin()
@@ -58,8 +58,6 @@ class Demand:
                 return
 
     def _notify(self) -> None:
-        self._changed.set()
-        self._changed = asyncio.Event()
-
-    async def _change(self) -> None:
-        await self._changed.wait()
+        begins, ends = (self._begun, self._ended) if self.wanted else (self._ended, self._begun)
+        begins.set()
+        ends.clear()

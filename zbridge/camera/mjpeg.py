@@ -1,16 +1,9 @@
 """Reads a camera's answer to a GET: an HTTP head, then pictures as parts of ``multipart/x-mixed-replace``. Sans-IO.
 
-Theory of operation. :class:`MjpegReader` takes bytes as they come and gives whole parts. It is in one of five steps:
-
-====== ========================================= ==========================
-step   waits for                                 next
-====== ========================================= ==========================
-ANSWER the blank line after the HTTP head        FIRST
-FIRST  the first delimiter, after any preamble   HEAD
-HEAD   delimiter and header of a part            SIZED or OPEN
-SIZED  so many bytes as Content-Length says      HEAD
-OPEN   the next delimiter, where no length came  HEAD
-====== ========================================= ==========================
+Theory of operation. :class:`MjpegReader` takes bytes as they come and gives whole parts. Its parser is a generator that
+yields where it needs more bytes: for the blank line after the HTTP head, the first delimiter after any preamble, and
+then for each part its delimiter and header, and so many bytes as Content-Length says, or, where no length came, all up
+to the next delimiter.
 
 Every step has a bound; beyond it, or where bytes contradict the form, ProtocolError is raised and the reader must not
 be used again. A part of a stated length is given as soon as its last byte has come if it ends as a JPEG does; else only
@@ -25,8 +18,7 @@ before a delimiter or between it and the header, and lines may end with a bare L
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
-from enum import Enum
+from collections.abc import Generator, Iterator
 
 import msgspec
 
@@ -91,16 +83,6 @@ class MjpegPart(msgspec.Struct, frozen=True):
     jpeg: bytes
 
 
-class MjpegStep(Enum):
-    """What a reader waits for."""
-
-    ANSWER = "the HTTP head"
-    FIRST = "the first part"
-    HEAD = "a part"
-    SIZED = "a picture of a stated length"
-    OPEN = "a picture and the delimiter after it"
-
-
 class MjpegReader:
     """Cuts the pictures out of one camera's answer.
 
@@ -112,150 +94,134 @@ class MjpegReader:
         self.head = self.boundary = b""
         self.ended = False
         self.rejected = 0
-        self.step = MjpegStep.ANSWER
-        self._delimiter = b""
-        self._part_head = b""
-        self._length = 0
-        self._is_image = True
-        self._doubtful: MjpegPart | None = None
         self._buffer = bytearray()
-        self._searched = self._breaks = 0
         self._parts: list[MjpegPart] = []
+        self._parser = self._parse()
 
     def __repr__(self) -> str:
-        return f"<MjpegReader waits for {self.step.value}, {len(self._buffer)} bytes>"
+        return f"<MjpegReader {len(self._buffer)} bytes{' ended' if self.ended else ''}>"
 
     def receive(self, data: bytes) -> list[MjpegPart]:
         """Take bytes; return the parts that are whole now. Raises ProtocolError."""
         self._buffer += data
-        while not self.ended and _STEPS[self.step](self):
-            pass
+        next(self._parser, None)
         parts, self._parts = self._parts, []
         return parts
 
-    # One method for each step; True: it is done, continue with the next
+    def _parse(self) -> Iterator[None]:
+        self.head = yield from self._take_head("an HTTP head")
+        self.boundary = _boundary(self.head)
+        delimiter = yield from self._find_first()
+        doubtful: MjpegPart | None = None
+        while True:
+            yield from self._await_delimiter(delimiter)
+            if doubtful is not None:
+                self._parts.append(doubtful)
+            if self._buffer[len(delimiter) :].startswith(b"--"):
+                self.ended = True
+                self._buffer.clear()
+                return
+            head = yield from self._take_head("the header of a part")
+            fields = _fields(head[len(delimiter) :])
+            kind = fields.get(b"content-type", _KINDS[0]).partition(b";")[0].strip().lower()
+            length = _length(fields)
+            jpeg = yield from (self._take_open(delimiter) if length < 0 else self._take_sized(length))
+            part, doubtful = MjpegPart(head, jpeg), None
+            if kind not in _KINDS or not is_jpeg(jpeg):
+                self.rejected += 1
+            elif length < 0 or is_whole(jpeg):
+                self._parts.append(part)
+            else:
+                doubtful = part
 
-    def _read_answer(self) -> bool:
-        head = self._take_head("an HTTP head")
-        if head is None:
-            return False
-        status = _STATUS.match(head)
-        if status is None:
-            raise ProtocolError("the answer is not HTTP")
-        if status[1] != b"200":
-            raise ProtocolError(f"the answer is HTTP {status[1].decode()}")
-        fields = _fields(head)
-        for name in (b"transfer-encoding", b"content-encoding"):
-            if fields.get(name, b"identity").lower() != b"identity":
-                raise ProtocolError(f"the answer has a {name.decode()}, which nobody asked for")
-        kind = fields.get(b"content-type", b"")
-        if not kind.lower().startswith(b"multipart/"):
-            raise ProtocolError("the answer is not multipart/x-mixed-replace")
-        boundary = _BOUNDARY.search(kind)
-        if boundary is None:
-            raise ProtocolError("the answer names no boundary")
-        self.head, self.boundary, self.step = head, boundary[1] or boundary[2], MjpegStep.FIRST
-        return True
+    # What the parser waits for
 
-    def _read_first(self) -> bool:
-        written = (b"--" + self.boundary, *((self.boundary,) if self.boundary.startswith(b"--") else ()))
-        for delimiter in written:
-            at = self._buffer.find(delimiter)
-            if at >= 0:
-                self._delimiter, self.step = delimiter, MjpegStep.HEAD
-                self._drop(at)
-                return True
-        if len(self._buffer) > HEAD_BYTES:
-            raise ProtocolError(f"no part within {HEAD_BYTES} bytes")
-        return False
+    def _take_head(self, what: str) -> Generator[None, None, bytes]:
+        """Take all bytes through the next blank line."""
+        searched = 0
+        while True:
+            found = _BLANK.search(self._buffer, searched)
+            end = found.end() if found else len(self._buffer)
+            if end > HEAD_BYTES:
+                raise ProtocolError(f"{what} of more than {HEAD_BYTES} bytes")
+            if found:
+                return self._cut(end)
+            searched = max(0, end - 3)
+            yield
 
-    def _read_head(self) -> bool:
-        self._skip_breaks()
-        if not self._begins_with_delimiter():
-            return False
-        end = len(self._delimiter) + 2
-        if self._buffer[end - 2 : end] == b"--":
-            self.ended = True
-            self._buffer.clear()
-            return False
-        head = self._take_head("the header of a part")
-        if head is None:
-            return False
-        fields = _fields(head[len(self._delimiter) :])
-        kind = fields.get(b"content-type", _KINDS[0]).partition(b";")[0].strip().lower()
-        self._part_head, self._is_image, self._length = head, kind in _KINDS, _length(fields)
-        self.step = MjpegStep.OPEN if self._length < 0 else MjpegStep.SIZED
-        return True
+    def _find_first(self) -> Generator[None, None, bytes]:
+        """Drop what precedes the first delimiter, and return the delimiter as the camera writes it."""
+        written = [b"--" + self.boundary] + ([self.boundary] if self.boundary.startswith(b"--") else [])
+        while True:
+            for delimiter in written:
+                at = self._buffer.find(delimiter)
+                if at >= 0:
+                    del self._buffer[:at]
+                    return delimiter
+            if len(self._buffer) > HEAD_BYTES:
+                raise ProtocolError(f"no part within {HEAD_BYTES} bytes")
+            yield
 
-    def _read_sized(self) -> bool:
-        if len(self._buffer) < self._length:
-            return False
-        self._finish(bytes(self._buffer[: self._length]), followed=False)
-        self._drop(self._length)
-        return True
+    def _await_delimiter(self, delimiter: bytes) -> Iterator[None]:
+        """Drop line breaks, and wait for the delimiter and two more bytes."""
+        breaks = 0
+        while True:
+            begin = bytes(self._buffer[: _BREAKS + 1])
+            count = len(begin) - len(begin.lstrip(b"\r\n"))
+            breaks += count
+            if breaks > _BREAKS:
+                raise ProtocolError(f"more than {_BREAKS} bytes of line breaks after a picture")
+            del self._buffer[:count]
+            if not delimiter.startswith(self._buffer[: len(delimiter)]):
+                raise ProtocolError("no delimiter where a part ends: its Content-Length is wrong")
+            if len(self._buffer) >= len(delimiter) + 2:
+                return
+            yield
 
-    def _read_open(self) -> bool:
-        delimiter = b"\n" + self._delimiter
-        at = self._buffer.find(delimiter, self._searched)
+    def _take_sized(self, length: int) -> Generator[None, None, bytes]:
+        while len(self._buffer) < length:
+            yield
+        return self._cut(length)
+
+    def _take_open(self, delimiter: bytes) -> Generator[None, None, bytes]:
+        """Take a picture up to the next delimiter."""
+        end, searched = b"\n" + delimiter, 0
         most = PICTURE_BYTES + 1  # with the carriage return before the delimiter
-        if at < 0 and len(self._buffer) <= most + len(delimiter):
-            self._searched = max(0, len(self._buffer) - len(delimiter))
-            return False
+        while (at := self._buffer.find(end, searched)) < 0 and len(self._buffer) <= most + len(end):
+            searched = max(0, len(self._buffer) - len(end))
+            yield
         if at < 0 or at > most:
             raise ProtocolError(f"a picture of more than {PICTURE_BYTES} bytes")
-        self._finish(bytes(self._buffer[:at]).removesuffix(b"\r"), followed=True)
-        self._drop(at + 1)
-        return True
+        jpeg = self._cut(at).removesuffix(b"\r")
+        del self._buffer[:1]
+        return jpeg
 
-    # What steps share
-
-    def _skip_breaks(self) -> None:
-        """Leave out the line breaks between a picture and the next delimiter."""
-        begin = bytes(self._buffer[: _BREAKS + 1])
-        count = len(begin) - len(begin.lstrip(b"\r\n"))
-        self._breaks += count
-        if self._breaks > _BREAKS:
-            raise ProtocolError(f"more than {_BREAKS} bytes of line breaks after a picture")
-        if count:
-            self._drop(count)
-
-    def _begins_with_delimiter(self) -> bool:
-        """Tell whether the delimiter has come, and give the part that it confirms; False: too few bytes."""
-        known = self._buffer[: len(self._delimiter)]
-        if not self._delimiter.startswith(known):
-            raise ProtocolError("no delimiter where a part ends: its Content-Length is wrong")
-        if len(self._buffer) < len(self._delimiter) + 2:
-            return False
-        if self._doubtful is not None:
-            self._parts.append(self._doubtful)
-            self._doubtful = None
-        return True
-
-    def _finish(self, jpeg: bytes, *, followed: bool) -> None:
-        self.step, self._breaks = MjpegStep.HEAD, 0
-        if not (self._is_image and is_jpeg(jpeg)):
-            self.rejected += 1
-        elif followed or is_whole(jpeg):
-            self._parts.append(MjpegPart(self._part_head, jpeg))
-        else:
-            self._doubtful = MjpegPart(self._part_head, jpeg)
-
-    def _take_head(self, what: str) -> bytes | None:
-        """Take all bytes through the next blank line; None: it has not come yet."""
-        found = _BLANK.search(self._buffer, self._searched)
-        end = found.end() if found else len(self._buffer)
-        if end > HEAD_BYTES:
-            raise ProtocolError(f"{what} of more than {HEAD_BYTES} bytes")
-        if found is None:
-            self._searched = max(0, end - 3)
-            return None
-        head = bytes(self._buffer[:end])
-        self._drop(end)
-        return head
-
-    def _drop(self, count: int) -> None:
+    def _cut(self, count: int) -> bytes:
+        """Take so many bytes out of the buffer."""
+        cut = bytes(self._buffer[:count])
         del self._buffer[:count]
-        self._searched = 0
+        return cut
+
+
+def _boundary(head: bytes) -> bytes:
+    """Read the boundary that an HTTP head names; raise ProtocolError where it promises no such stream."""
+    status = _STATUS.match(head)
+    if status is None:
+        raise ProtocolError("the answer is not HTTP")
+    if status[1] != b"200":
+        raise ProtocolError(f"the answer is HTTP {status[1].decode()}")
+    fields = _fields(head)
+    for name in (b"transfer-encoding", b"content-encoding"):
+        if fields.get(name, b"identity").lower() != b"identity":
+            raise ProtocolError(f"the answer has a {name.decode()}, which nobody asked for")
+    kind = fields.get(b"content-type", b"")
+    if not kind.lower().startswith(b"multipart/"):
+        raise ProtocolError("the answer is not multipart/x-mixed-replace")
+    found = _BOUNDARY.search(kind)
+    if found is None:
+        raise ProtocolError("the answer names no boundary")
+    boundary: bytes = found[1] or found[2]
+    return boundary
 
 
 def _fields(head: bytes) -> dict[bytes, bytes]:
@@ -278,12 +244,3 @@ def _length(fields: dict[bytes, bytes]) -> int:
     if int(text) > PICTURE_BYTES:
         raise ProtocolError(f"a picture of {int(text)} bytes exceeds {PICTURE_BYTES}")
     return int(text)
-
-
-_STEPS: dict[MjpegStep, Callable[[MjpegReader], bool]] = {
-    MjpegStep.ANSWER: MjpegReader._read_answer,
-    MjpegStep.FIRST: MjpegReader._read_first,
-    MjpegStep.HEAD: MjpegReader._read_head,
-    MjpegStep.SIZED: MjpegReader._read_sized,
-    MjpegStep.OPEN: MjpegReader._read_open,
-}

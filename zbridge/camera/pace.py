@@ -18,9 +18,6 @@ class ReadBudget:
     def __init__(self) -> None:
         self._paid_until = 0.0
 
-    def __repr__(self) -> str:
-        return f"<ReadBudget used until {self._paid_until:g}>"
-
     def pause_s(self, size: int, pictures: int, now: float) -> float:
         """Count bytes and pictures that were read; return for how long nothing is to be read, seconds."""
         self._paid_until = max(self._paid_until, now - 1.0) + max(size / BYTES_S, pictures / PICTURES_S)

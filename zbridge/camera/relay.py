@@ -24,15 +24,15 @@ from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.protocol.networks import is_among
 from zbridge.protocol.session_table import Backoff
+from zbridge.tasks import Tasks, race
 from zbridge.transport.waiting import waiting_sockets
 
 
 class Shot(msgspec.Struct, frozen=True):
-    """One picture, and the stream it belongs to: ``answer`` is that stream's HTTP head. number: rises by one."""
+    """One picture, and the stream it belongs to. number: rises by one."""
 
     number: int
-    answer: bytes
-    boundary: bytes
+    stream: MjpegReader
     part: MjpegPart
 
 
@@ -44,13 +44,9 @@ class Latest:
         self._shot: Shot | None = None
         self._came = asyncio.Event()
 
-    def __repr__(self) -> str:
-        return f"<Latest {self._number}>"
-
     def show(self, stream: MjpegReader, part: MjpegPart) -> None:
-        """Replace the picture by a newer one."""
         self._number += 1
-        self._shot = Shot(self._number, stream.head, stream.boundary, part)
+        self._shot = Shot(self._number, stream, part)
         self._came.set()
         self._came = asyncio.Event()
 
@@ -100,7 +96,7 @@ class Relay:
         self._demand = demand
         self._latest = latest
         self._report = report
-        self._clients: set[asyncio.Task[None]] = set()
+        self._clients = Tasks()
         self._accepted = metrics.count("camera_relay_accepted")
         self._refused = metrics.count("camera_relay_refused")
         self._sent = metrics.count("camera_relay_pictures")
@@ -128,7 +124,7 @@ class Relay:
             finally:
                 for listening in sockets:
                     listening.close()
-                await self._end_clients()
+                await self._clients.end()
 
     async def _accept(self, listening: socket.socket) -> None:
         loop = asyncio.get_running_loop()
@@ -145,9 +141,7 @@ class Relay:
                 await asyncio.sleep(_REFUSAL_S)
                 continue
             self._accepted.value += 1
-            task = asyncio.create_task(self._serve(client))
-            self._clients.add(task)
-            task.add_done_callback(self._clients.discard)
+            self._clients.start(self._serve(client))
 
     async def _serve(self, client: socket.socket) -> None:
         """Answer one client, and give it pictures until it goes or takes none."""
@@ -175,15 +169,10 @@ class Relay:
         """Send pictures until the client ends the connection, or sends more than a request."""
         writer.transport.set_write_buffer_limits(0)  # drain() returns when the socket has taken all
         self._demand.join()
-        sending = asyncio.create_task(self._send(writer))
-        leaving = asyncio.create_task(reader.read(1))
         try:
-            await asyncio.wait((sending, leaving), return_when=asyncio.FIRST_COMPLETED)
+            await race(self._send(writer), reader.read(1))
         finally:
             self._demand.leave()
-            sending.cancel()
-            leaving.cancel()
-            await asyncio.gather(sending, leaving, return_exceptions=True)
 
     async def _send(self, writer: asyncio.StreamWriter) -> None:
         number, boundary = 0, None
@@ -191,9 +180,9 @@ class Relay:
             async with asyncio.timeout(AWAY_S):
                 shot = await self._latest.after(number)
             if boundary is None:
-                boundary = shot.boundary
-                writer.write(shot.answer)
-            elif boundary != shot.boundary:
+                boundary = shot.stream.boundary
+                writer.write(shot.stream.head)
+            elif boundary != shot.stream.boundary:
                 return  # another camera answers now: the client cannot read its parts
             elif shot.number > number + 1:
                 self._skipped.value += shot.number - number - 1
@@ -203,12 +192,6 @@ class Relay:
                 await writer.drain()
             number = shot.number
             self._sent.value += 1
-
-    async def _end_clients(self) -> None:
-        clients = tuple(self._clients)
-        for task in clients:
-            task.cancel()
-        await asyncio.gather(*clients, return_exceptions=True)
 
 
 def _refusal(request: bytes) -> bytes | None:

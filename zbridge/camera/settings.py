@@ -63,7 +63,10 @@ def plan_camera(settings: CameraSettings) -> CameraPlan:
     if settings.relay is None and settings.allow:
         raise ConfigError(f"camera.allow = {list(settings.allow)}: expected only with camera.relay")
     allow = parse_networks("camera.allow", settings.allow)
-    relay = _relay(settings.relay) if settings.relay is not None else None
+    try:
+        relay = Address.parse(f"tcp://{settings.relay}") if settings.relay is not None else None
+    except LinkError as error:
+        raise ConfigError(f"camera.relay = {settings.relay!r}: expected host:port") from error
     return CameraPlan(_source(settings.url), settings, relay, allow)
 
 
@@ -79,10 +82,3 @@ def _source(url: str) -> CameraSource:
     if parts.scheme != "http" or not host or port == 0 or odd:
         raise ConfigError(f"camera.url = {url!r}: {_EXPECTED}")
     return CameraSource(host, port or 80, target)
-
-
-def _relay(text: str) -> Address:
-    try:
-        return Address.parse(f"tcp://{text}")
-    except LinkError as error:
-        raise ConfigError(f"camera.relay = {text!r}: expected host:port") from error

@@ -33,7 +33,8 @@ async def fetch(source: CameraSource, stall_s: float, on_parts: OnParts) -> None
     """
     reader, writer = await _connect(source)
     try:
-        writer.write(_request(source))
+        lines = (f"GET {source.target} HTTP/1.0", f"Host: {source.authority}", "User-Agent: zbridge", "", "")
+        writer.write("\r\n".join(lines).encode("ascii"))
         await _read(reader, stall_s, on_parts)
     except OSError as error:
         raise LinkError(explain(error)) from error
@@ -55,11 +56,6 @@ async def _connect(source: CameraSource) -> tuple[asyncio.StreamReader, asyncio.
         raise LinkError(f"no connection within {CONNECT_S:g} s") from None
     except OSError as error:
         raise LinkError(explain(error)) from error
-
-
-def _request(source: CameraSource) -> bytes:
-    lines = (f"GET {source.target} HTTP/1.0", f"Host: {source.authority}", "User-Agent: zbridge", "", "")
-    return "\r\n".join(lines).encode("ascii")
 
 
 async def _read(reader: asyncio.StreamReader, stall_s: float, on_parts: OnParts) -> None:

@@ -10,7 +10,6 @@ from typing import Annotated
 import typer
 
 from zbridge.app import listener_template, load, robot_template, until_signal
-from zbridge.app.tasks import together
 from zbridge.bus.tls.files import ends_soon, folder_tls, out_of_date, utc_now
 from zbridge.cli import (
     certs,
@@ -34,6 +33,7 @@ from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.protocol.plugin import HqSimulation, Protocol, Simulation, find_protocol, protocol_names
 from zbridge.security.member import check_member, not_checked
+from zbridge.tasks import together
 from zbridge.toml import prefixed
 
 app = typer.Typer(

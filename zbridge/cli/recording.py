@@ -15,7 +15,6 @@ import msgspec
 
 import zbridge
 from zbridge.app import until_signal
-from zbridge.app.tasks import together
 from zbridge.bus import BusSettings, read_key_expr
 from zbridge.bus.tls.files import own_name, own_role
 from zbridge.cli.bus import console, errors, joined, print_columns
@@ -27,6 +26,7 @@ from zbridge.fleet.topics import KeySpace, is_name
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.protocol.plugin import Protocol, find_protocol
+from zbridge.tasks import together
 from zbridge.toml import prefixed
 from zbridge.views.recording.capture import BusCapture, RecordPlan, publish_mark
 from zbridge.views.recording.contents import Pictures, describe_configuration

@@ -63,7 +63,7 @@ def run_ros2(bus: BusSettings | None, default: BusSettings, file: Path | None, g
 
     def ready(view: View) -> None:
         gc.freeze()  # the types of ROS live as long as the process: the collector would take 18 ms to look at them
-        where = ", ".join(planned.ros.connect)
+        where = ", ".join(planned.router.connect)
         print(f"ROS 2 {planned.distro}, domain {planned.domain}, at {where}", flush=True)  # noqa: T201
 
     run_loop(until_signal(server.serve(planned, bus or written.bus or default, Metrics(), ready)))

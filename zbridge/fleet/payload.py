@@ -7,6 +7,7 @@ present.
 
 from __future__ import annotations
 
+import struct
 from functools import cache
 from typing import Any, TypeVar
 
@@ -19,6 +20,11 @@ from zbridge.fleet.messages import FleetMessage, Map, Scan
 F = TypeVar("F", bound=FleetMessage)
 
 ENCODING = "application/msgpack"
+_STAMP_NAME = b"\xa8stamp_ns\xcf"
+"""The field as our encoder writes it: the first of the map, its number in 8 bytes."""
+_STAMP_AT = 1 + len(_STAMP_NAME)
+_MAPS = range(0x80, 0x90)
+_LARGEST_STAMP = 2**64 - 1
 
 
 def schema(message: type[FleetMessage]) -> str:
@@ -79,6 +85,25 @@ def unpack(payload: bytes) -> dict[str, Any]:
     if not isinstance(values, dict):
         raise PayloadError(f"a map was expected, got {type(values).__name__}")
     return values
+
+
+def measured_ns(stamp_ns: int | msgspec.UnsetType, now_ns: int, end_ns: int) -> int:
+    """Return the stamp, Unix nanoseconds; ``now_ns`` where there is none, or none from 0 to before ``end_ns``."""
+    return stamp_ns if isinstance(stamp_ns, int) and 0 <= stamp_ns < end_ns else now_ns
+
+
+def with_stamp(payload: bytes, stamp_ns: int) -> bytes:
+    """Return a payload with this stamp in place of its own; unchanged where it has none or cannot be read."""
+    stamp_ns = min(max(stamp_ns, 0), _LARGEST_STAMP)
+    if payload[1:_STAMP_AT] == _STAMP_NAME and payload[0] in _MAPS and len(payload) >= _STAMP_AT + 8:
+        return payload[:_STAMP_AT] + struct.pack(">Q", stamp_ns) + payload[_STAMP_AT + 8 :]
+    if b"stamp_ns" not in payload:
+        return payload
+    try:
+        values = unpack(payload)
+    except PayloadError:
+        return payload
+    return pack(values | {"stamp_ns": stamp_ns}) if "stamp_ns" in values else payload
 
 
 _EMPTY = b"\x80"

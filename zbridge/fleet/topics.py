@@ -299,6 +299,39 @@ def split_key(key: str) -> tuple[str, str, str] | None:
     return (realm, robot, path) if path else None
 
 
+@lru_cache(maxsize=65536)
+def matches(key_expr: str, key: str) -> bool:
+    """Tell whether a key expression matches a key, as on the bus: ``@...`` matches only itself."""
+    return _follow(tuple(key_expr.split("/")), tuple(key.split("/")))
+
+
+def _follow(expression: tuple[str, ...], chunks: tuple[str, ...]) -> bool:
+    """Follow all positions of the expression that the chunks so far may have reached."""
+    places = _behind_wildcards(expression, {0})
+    for chunk in chunks:
+        plain = not chunk.startswith("@")
+        reached = set()
+        for place in places:
+            if place < len(expression):
+                wanted = expression[place]
+                if wanted == "**" and plain:
+                    reached.add(place)
+                elif wanted == chunk or (wanted == "*" and plain):
+                    reached.add(place + 1)
+        places = _behind_wildcards(expression, reached)
+    return len(expression) in places
+
+
+def _behind_wildcards(expression: tuple[str, ...], places: set[int]) -> set[int]:
+    """Add the places behind each ``**``, which may stand for nothing."""
+    found = set(places)
+    for place in sorted(places):
+        while place < len(expression) and expression[place] == "**":
+            place += 1
+            found.add(place)
+    return found
+
+
 def gateways_of(key_expr: str) -> str:
     """Write the key expression of the liveliness tokens of the gateways whose keys an expression may match."""
     realm, robot, *_ = (*key_expr.split("/"), "**")

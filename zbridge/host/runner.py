@@ -37,7 +37,6 @@ from collections.abc import Callable
 
 import msgspec
 
-from zbridge.app.tasks import Background
 from zbridge.errors import HandoverError, NotReady
 from zbridge.host.duplicates import PERIOD_S, TIMES
 from zbridge.host.fd_channel import FdChannel
@@ -47,6 +46,7 @@ from zbridge.host.process import KILLED_S, GatewayProcess
 from zbridge.host.replacement import RunnerState
 from zbridge.host.succession import GONE_S, Launcher, Succession
 from zbridge.host.watchdog import HEALTHY_S, RestartDelay
+from zbridge.tasks import Tasks
 from zbridge.toml import FILE_BYTES
 
 log = logging.getLogger("zbridge.host")
@@ -85,7 +85,7 @@ class Runner:
         self._restart_delay = RestartDelay()
         self._former: set[GatewayProcess] = set()
         """Those that have handed over or crashed, until they have ended."""
-        self._tasks = Background()
+        self._tasks = Tasks()
         self._asked = asyncio.Event()
         """Set when the process asks for a successor."""
         self._settled = asyncio.Event()
@@ -231,7 +231,7 @@ class Runner:
         if successor is None:
             await process.deposit.drain()
         elif successor.file.content != self.file.content:  # the file changed while the process died
-            self._tasks.run(self.restart(self.file))
+            self._tasks.start(self.restart(self.file))
         self._attended.set()
         return successor
 
@@ -268,7 +268,7 @@ class Runner:
         self.file = msgspec.structs.replace(successor.file, path=self.file.path)  # it may have been renamed meanwhile
         log.info("%s: process %d serves it now", self.file.robot, successor.pid)
         self._former.add(process)
-        self._tasks.run(self._await_end(process))
+        self._tasks.start(self._await_end(process))
         return True
 
     async def _await_end(self, process: GatewayProcess) -> None:
@@ -340,4 +340,4 @@ class Runner:
         def alone() -> bool:
             return process is self.process and self._succession.successor is None and not self._ending
 
-        self._tasks.run(self._succession.begin(process, far_end, self.file.path, self._most_bytes, alone))
+        self._tasks.start(self._succession.begin(process, far_end, self.file.path, self._most_bytes, alone))

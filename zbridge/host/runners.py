@@ -11,11 +11,11 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from zbridge.app.handover.processes import Systemd
-from zbridge.app.tasks import Background
 from zbridge.host.files import Changes, RobotFile
 from zbridge.host.process import GatewayProcess
 from zbridge.host.replacement import RunnerState
 from zbridge.host.runner import Runner
+from zbridge.tasks import Tasks
 
 log = logging.getLogger("zbridge.host")
 
@@ -50,7 +50,7 @@ class Runners:
         self.all_started = False
         self._leaving: set[Runner] = set()
         """Those whose file is gone, until their process has ended."""
-        self._running = Background()
+        self._running = Tasks()
         self._ends = False
 
     def __repr__(self) -> str:
@@ -94,10 +94,10 @@ class Runners:
             self.faults[file.path] = str(file.fault)
         for path in changes.gone:
             log.info("%s: is gone: its robot's gateway ends", path)
-            self._running.run(self._leave(self.by_path.pop(path)))
+            self._running.start(self._leave(self.by_path.pop(path)))
         for file in changes.changed:
             log.info("%s: has changed", file.path)
-            self._running.run(self.by_path[file.path].restart(file))
+            self._running.start(self.by_path[file.path].restart(file))
         for path in [*changes.gone, *(file.path for file in (*changes.came, *changes.changed))]:
             self.faults.pop(path, None)
         for number, file in enumerate(changes.came):
@@ -140,13 +140,13 @@ class Runners:
         """End all gateways, each with its robot's stop."""
         self._ends = True
         await asyncio.gather(*(runner.end() for runner in (*self.by_path.values(), *self._leaving)))
-        await self._running.cancel()
+        await self._running.end()
 
     def _run(self, file: RobotFile, state: RunnerState | None = None) -> None:
         self.by_path[file.path] = runner = self._make(file)
         if state is not None:
             runner.resume(state)
-        self._running.run(runner.run())
+        self._running.start(runner.run())
 
     async def _leave(self, runner: Runner) -> None:
         self._leaving.add(runner)

@@ -20,7 +20,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from zbridge.app.handover.processes import Systemd
-from zbridge.app.tasks import Background
 from zbridge.errors import ConfigError, HandoverError, NotReady
 from zbridge.host.files import Follower, RobotFile, compare, read_all
 from zbridge.host.fork_client import ForkClient, Installation
@@ -28,6 +27,7 @@ from zbridge.host.replacement import VERSION, SupervisorState, quiet_threads, re
 from zbridge.host.runner import Runner
 from zbridge.host.runners import Reports, Runners
 from zbridge.host.settings import HostSettings
+from zbridge.tasks import Tasks
 
 log = logging.getLogger("zbridge.host")
 
@@ -72,7 +72,7 @@ class Supervisor:
         self.runners = Runners(self._runner, self._state_changed, stagger_s=host.stagger_s)
         self._reports = Reports(Systemd(), self.runners)
         self._follower = Follower(sources, self.runners.faults, host.file_bytes)
-        self._running = Background()
+        self._running = Tasks()
         self._timer: asyncio.TimerHandle | None = None
         self._reload = asyncio.Event()
 
@@ -100,7 +100,7 @@ class Supervisor:
                 await self._start_forks()
             self._code = self._forks.stamp
             for task in (self.follow(), self._reports.live()):
-                self._running.run(task)
+                self._running.start(task)
             self._check_watchdogs()
             await self.runners.apply(compare({}, files), first=True)
             await asyncio.Event().wait()
@@ -120,7 +120,7 @@ class Supervisor:
     async def _end(self) -> None:
         self._reports.ending()
         await self.runners.end()
-        await self._running.cancel()
+        await self._running.end()
         if self._timer is not None:
             self._timer.cancel()
         self._reports.close()

@@ -21,7 +21,6 @@ from zbridge.app.config import GatewayPlan
 from zbridge.app.gateway import Gateway, Neighbourhood
 from zbridge.app.joining import SessionUseless, can_connect, join_bus, watch_certificate, watch_session
 from zbridge.app.prometheus import serve_metrics
-from zbridge.app.tasks import together
 from zbridge.bus import Bus
 from zbridge.bus.tls.files import own_certificate
 from zbridge.control.context import Conditions
@@ -30,6 +29,7 @@ from zbridge.host.addresses import hold_addresses
 from zbridge.host.settings import HostSettings
 from zbridge.metrics import Metrics
 from zbridge.protocol.session_table import Backoff
+from zbridge.tasks import together
 from zbridge.transport.tcp import SHARED_READ_BYTES
 
 log = logging.getLogger("zbridge.host.together")

@@ -11,10 +11,10 @@ from zbridge.hq.freeze import FreezeWatch
 from zbridge.hq.listener_log import ConnectionLog, FailureLog
 from zbridge.hq.robot_subscription import RobotSubscription
 from zbridge.hq.settings import HqSettings
-from zbridge.hq.tasks import Tasks
 from zbridge.metrics import Count, Metrics
 from zbridge.protocol.plugin import HqSide
 from zbridge.protocol.session import Limits
+from zbridge.tasks import Tasks
 
 
 class ListenerCounts(msgspec.Struct, frozen=True):

@@ -26,13 +26,13 @@ from zbridge.hq.refusals import RefusalReports
 from zbridge.hq.robot_queries import RobotQueries
 from zbridge.hq.robot_subscription import RobotSubscription
 from zbridge.hq.settings import ListenerPlan
-from zbridge.hq.tasks import Tasks
 from zbridge.lease.lease_holder import raw_ms
 from zbridge.metrics import Metrics
 from zbridge.protocol.kept import Exported
 from zbridge.protocol.plugin import ATTEND_S
 from zbridge.protocol.session import Limits, Session
 from zbridge.protocol.session_table import SessionTable
+from zbridge.tasks import Tasks
 from zbridge.transport import Accepted, Conversation, Door, Link, Parcel, Receiver, TlsLink, listen
 from zbridge.transport.kernel import KERNEL, Kernel
 

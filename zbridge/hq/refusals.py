@@ -15,9 +15,9 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import TOLD, Refusal, Refusals
 from zbridge.fleet.topics import KeySpace
-from zbridge.hq.tasks import Tasks
 from zbridge.lease.lease_events import EXPLAINED, NAMED
 from zbridge.metrics import Count
+from zbridge.tasks import Tasks
 
 log = logging.getLogger("zbridge.hq")
 

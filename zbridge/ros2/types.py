@@ -30,6 +30,7 @@ class Types:
         self.distro = distro
         self._store = store
         self._hashes: dict[str, str] = {}
+        self._parts: dict[str, list[tuple[str, str]]] = {}
         self._made: dict[str, tuple[Any, dict[str, Any], dict[str, str]]] = {}
         for service in _SERVICES:
             _add_service(store, service)
@@ -56,6 +57,22 @@ class Types:
         A field that this distribution does not have is left out: later ones have more. Arrays are numpy arrays. What
         was left out is shared by all messages: it must not be changed.
         """
+        return self._make(type_name, fields)
+
+    def nested(self, type_name: str, fields: dict[str, Any]) -> Any:
+        """Make a message as :meth:`message` does, of parts that are such fields, too, or lists of them.
+
+        ``fields`` is used up.
+        """
+        parts = self._parts.get(type_name)
+        if parts is None:
+            parts = self._parts[type_name] = _parts_of(self._store.fielddefs[type_name][1])
+        for name, part in parts:
+            if name in fields:
+                value = fields[name]
+                fields[name] = (
+                    [self.nested(part, each) for each in value] if type(value) is list else self.nested(part, value)
+                )
         return self._make(type_name, fields)
 
     def encode(self, message: Any) -> bytes:
@@ -125,6 +142,15 @@ def _attribute(field: str) -> str:
     from rosbags.typesys.base import normalize_fieldname
 
     return normalize_fieldname(field)
+
+
+def _parts_of(fields: Any) -> list[tuple[str, str]]:
+    """Return the fields that are messages, or lists of messages, and the types of these."""
+    from rosbags.interfaces import Nodetype
+
+    lists = (Nodetype.ARRAY, Nodetype.SEQUENCE)
+    kinds = ((name, inner[0] if node in lists else (node, inner)) for name, (node, inner) in fields)
+    return [(name, of) for name, (node, of) in kinds if node == Nodetype.NAME]
 
 
 def _add_service(store: Any, service: str) -> None:

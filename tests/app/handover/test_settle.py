@@ -13,10 +13,10 @@ from zbridge.app.config import plan
 from zbridge.app.handover.channel import VERSION, HandoverChannel, HandoverState, Hello
 from zbridge.app.handover.restarts import Restarts
 from zbridge.app.handover.sequence import ColdStart
-from zbridge.app.tasks import together
 from zbridge.errors import HandoverError, NotReady
 from zbridge.fleet.topics import KeySpace
 from zbridge.protocol.kept import Exported
+from zbridge.tasks import together
 from zbridge.transport import Parcel
 
 

@@ -4,7 +4,7 @@ import ipaddress
 
 import pytest
 
-from zbridge.views.foxglove.admission import Admitted, Policy, Rejection, UpgradeRequest, ViewerAdmission
+from zbridge.views.foxglove.admission import Admitted, Policy, Rejection, ViewerAdmission
 
 TOKEN = "a" * 32
 FOXGLOVE, PAGE, EVIL = "https://app.foxglove.dev", "https://robots.example", "https://evil.example"
@@ -41,7 +41,7 @@ CASES = [
 def test_a_handshake_is_admitted_or_turned_away(
     policy: Policy, path: str, origins: tuple[str, ...], subprotocols: tuple[str, ...], expected: bool | str
 ) -> None:
-    decision = ViewerAdmission(policy).admit(UpgradeRequest(path, origins, subprotocols), "10.0.0.7", 3)
+    decision = ViewerAdmission(policy).admit(path, origins, subprotocols, "10.0.0.7", 3)
     if isinstance(decision, Rejection):
         assert decision.reason == expected
         assert TOKEN not in decision.text
@@ -54,7 +54,7 @@ def test_a_handshake_is_admitted_or_turned_away(
     [("/", "10.0.0.7"), ("/?name=anna", "anna"), ("/?name=" + "x" * 99, "x" * 24), ("/?name=%00/*", "%00%2F%2A")],
 )
 def test_a_viewer_is_called_as_it_says_as_far_as_keys_can_hold_it(path: str, label: str) -> None:
-    decision = ViewerAdmission(Policy()).admit(UpgradeRequest(path, (), SPOKEN), "10.0.0.7", 0)
+    decision = ViewerAdmission(Policy()).admit(path, (), SPOKEN, "10.0.0.7", 0)
     assert isinstance(decision, Admitted)
     assert decision.label == label
 

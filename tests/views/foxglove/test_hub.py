@@ -49,7 +49,7 @@ def ids(viewer: Looking) -> dict[str, int]:
     }
 
 
-def test_the_source_is_told_of_the_first_viewer_of_a_channel_and_of_the_last() -> None:
+def test_the_source_is_told_of_each_viewer_of_a_channel_and_when_the_last_one_goes() -> None:
     hub, wanted = a_hub()
     first, second = Looking(), Looking()
     for viewer in (first, second):
@@ -57,13 +57,13 @@ def test_the_source_is_told_of_the_first_viewer_of_a_channel_and_of_the_last() -
     scan = ids(first)["/r1/scan"]
     assert hub.subscribe(first, 5, scan)
     assert hub.subscribe(second, 6, scan)
-    assert wanted == [("scan", True)]
+    assert wanted == [("scan", True)] * 2
     hub.publish("/r1/scan", 9, b"data")
     assert (first.shown, second.shown) == ([(5, b"data")], [(6, b"data")])
     hub.unsubscribe(first, scan)
-    assert wanted == [("scan", True)]
+    assert wanted == [("scan", True)] * 2
     hub.leave(second)
-    assert wanted == [("scan", True), ("scan", False)]
+    assert wanted == [("scan", True)] * 2 + [("scan", False)]
     hub.publish("/r1/scan", 9, b"data")
     assert len(first.shown) == 1
 

@@ -10,8 +10,7 @@ from typing import Any
 import pytest
 
 from zbridge.views.foxglove.hub import Hub
-from zbridge.views.foxglove.playback import LATE_S, RECENT_S, Playback
-from zbridge.views.foxglove.recording import PlayedMessage
+from zbridge.views.foxglove.playback import LATE_S, RECENT_S, Playback, PlayedMessage
 from zbridge.views.foxglove.requests import PlaybackRequest
 from zbridge.views.pictures import ViewerChannel
 from zbridge.views.schemas import Schema

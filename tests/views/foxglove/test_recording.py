@@ -6,7 +6,7 @@ import pytest
 
 from tests.views.foxglove.recordings import BEGIN_NS, POSE_NS, record
 from zbridge.errors import ZbridgeError
-from zbridge.views.foxglove.recording import IndexedRecording
+from zbridge.views.foxglove.playback import IndexedRecording
 
 S = 10**9
 SHOWN = {"/r1/map", "/r1/status", "/r1/log", "/r1/pose", "/r1/tf", "/r1/trail", "/r1/scan"}

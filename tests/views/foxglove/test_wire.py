@@ -7,7 +7,7 @@ import pytest
 
 from zbridge.errors import ProtocolError
 from zbridge.views.foxglove import replies, requests
-from zbridge.views.foxglove.replies import PlaybackStatus, Service, StatusLevel
+from zbridge.views.foxglove.replies import PlaybackStatus, Service
 from zbridge.views.foxglove.requests import PlaybackRequest, Published, ServiceCall
 from zbridge.views.pictures import ViewerChannel
 from zbridge.views.schemas import Schema, foxglove_schema
@@ -36,8 +36,9 @@ TEXT = [
         '{"op":"serverInfo","name":"zb","capabilities":["clientPublish","time"],"supportedEncodings":["json"],'
         '"metadata":{"a":"b"},"sessionId":"17","dataStartTime":{"sec":0,"nsec":1},"dataEndTime":{"sec":2,"nsec":0}}',
     ),
-    (replies.unadvertise([2]), '{"op":"unadvertise","channelIds":[2]}'),
-    (replies.status(StatusLevel.ERROR, "Unknown"), '{"op":"status","level":2,"message":"Unknown"}'),
+    (replies.text("unadvertise", channelIds=[2]), '{"op":"unadvertise","channelIds":[2]}'),
+    (replies.warning("Unknown"), '{"op":"status","level":1,"message":"Unknown"}'),
+    (replies.warning("Unknown", "it"), '{"op":"status","level":1,"message":"Unknown","id":"it"}'),
     (
         replies.service_failure(ServiceCall(99, 78, "json", b""), "Unknown service"),
         '{"op":"serviceCallFailure","serviceId":99,"callId":78,"message":"Unknown service"}',
@@ -80,7 +81,6 @@ def test_services_are_told_with_the_schemas_of_both_ways() -> None:
     assert (entry["id"], entry["name"], entry["type"]) == (1, "/r1/stop", "zbridge/Stop")
     assert entry["request"]["encoding"] == entry["response"]["encoding"] == "json"
     assert json.loads(entry["request"]["schema"]) == {"type": "object"}
-    assert json.loads(replies.unadvertise_services([1])) == {"op": "unadvertiseServices", "serviceIds": [1]}
 
 
 SAID = [

@@ -11,9 +11,10 @@ import pytest
 
 from tests.views.recording import files
 from zbridge.errors import ConfigError
+from zbridge.fleet.topics import matches
 from zbridge.views.recording import export
 from zbridge.views.recording.export import export_arrays, export_tables
-from zbridge.views.recording.selection import Selection, matches
+from zbridge.views.recording.selection import Selection
 
 SCAN = {"angle_min": -1.0, "angle_increment": 0.5, "range_min": 0.1, "range_max": 8.0}
 

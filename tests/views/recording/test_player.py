@@ -9,9 +9,9 @@ import msgpack
 import pytest
 
 from tests.views.recording import files
+from zbridge.fleet.payload import with_stamp
 from zbridge.views.recording.player import PlaybackClock, Player
 from zbridge.views.recording.selection import Selection
-from zbridge.views.stamps import with_stamp
 
 S_NS = files.S_NS
 

@@ -22,14 +22,15 @@ FILE = {
 
 def test_defaults_are_those_of_ros() -> None:
     made = plan(Ros2Settings())
-    assert (made.domain, made.distro, made.drive, made.robots) == (0, "jazzy", False, frozenset())
-    assert (made.ros.connect, made.ros.effective_mode, made.ros.multicast) == (("tcp/localhost:7447",), "client", False)
+    assert (made.domain, made.distro, made.drive, made.robots) == (0, "jazzy", False, ())
+    router = made.router
+    assert (router.connect, router.effective_mode, router.multicast) == (("tcp/localhost:7447",), "client", False)
     assert made.body("r1") == RobotBody()
 
 
 def test_options_win_over_the_file() -> None:
     made = plan(replace(convert(FILE, Ros2Settings), domain=0, distro="kilted", robots=("r2",), ros=("tcp/a:1",)))
-    assert (made.domain, made.distro, made.robots, made.ros.connect) == (0, "kilted", {"r2"}, ("tcp/a:1",))
+    assert (made.domain, made.distro, made.robots, made.router.connect) == (0, "kilted", ("r2",), ("tcp/a:1",))
     assert made.drive
 
 

@@ -41,14 +41,6 @@ class Policy(msgspec.Struct, frozen=True):
     who: str = "foxglove"
 
 
-class UpgradeRequest(msgspec.Struct, frozen=True):
-    """The opening handshake of a connection. origins, subprotocols: of all headers of that name."""
-
-    path: str
-    origins: Sequence[str]
-    subprotocols: Sequence[str]
-
-
 class Rejection(msgspec.Struct, frozen=True):
     """A connection that is turned away. reason: one word, for counters; text: for people."""
 
@@ -71,9 +63,6 @@ class ViewerAdmission:
         self.policy = policy
         self._arrivals = Arrivals(ACCEPT_HZ)
 
-    def __repr__(self) -> str:
-        return f"<ViewerAdmission {self._arrivals!r}>"
-
     def refusal(self, host: str, connections: int, now: float) -> str | None:
         """Return why a connection is closed before it sends anything, as one word; None if it may continue."""
         if self.policy.networks and not is_among(host, self.policy.networks):
@@ -82,19 +71,21 @@ class ViewerAdmission:
             return "arrivals"
         return "full" if connections >= 2 * self.policy.viewers else None
 
-    def admit(self, request: UpgradeRequest, host: str, viewers: int) -> Admitted | Rejection:
-        """Decide about an opening handshake."""
-        if any(origin not in self.policy.origins for origin in request.origins):
+    def admit(
+        self, path: str, origins: Sequence[str], subprotocols: Sequence[str], host: str, viewers: int
+    ) -> Admitted | Rejection:
+        """Decide about an opening handshake. origins, subprotocols: of all headers of that name."""
+        if any(origin not in self.policy.origins for origin in origins):
             return Rejection(HTTPStatus.FORBIDDEN, "origin", "this Origin is not allowed")
-        query = parse_qs(urlsplit(request.path).query, max_num_fields=16)
+        query = parse_qs(urlsplit(path).query, max_num_fields=16)
         if self.policy.token is not None:
             given = query.get("token", [""])[0]
             if not hmac.compare_digest(given.encode(), self.policy.token.encode()):
                 return Rejection(HTTPStatus.UNAUTHORIZED, "token", "the token is missing or wrong")
         if viewers >= self.policy.viewers:
             return Rejection(HTTPStatus.SERVICE_UNAVAILABLE, "full", "as many viewers as there can be")
-        if SUBPROTOCOL not in request.subprotocols:
+        if SUBPROTOCOL not in subprotocols:
             return Rejection(HTTPStatus.BAD_REQUEST, "subprotocol", f"expected the subprotocol {SUBPROTOCOL}")
-        trusted = self.policy.token is not None or bool(request.origins)
+        trusted = self.policy.token is not None or bool(origins)
         name = escape(query.get("name", [""])[0] or host)[:LABEL]
         return Admitted(name, self.policy.drive and trusted)

@@ -103,10 +103,9 @@ class RobotCommands(ViewerCommands):
         gone = [number for number, (owner, _, _) in self._services.items() if owner == robot]
         for number in gone:
             del self._services[number]
-        self._hub.say(replies.unadvertise_services(gone))
+        self._hub.say(replies.text("unadvertiseServices", serviceIds=gone))
 
     def noted(self, robot: str, name: str, value: Any) -> None:
-        """Take note of a parameter's value."""
         if robot in self._robots and self._robots[robot].get(name) != value:
             self._robots[robot][name] = value
             self._hub.parameters_changed({f"{robot}.{name}": value})
@@ -198,11 +197,9 @@ class RobotCommands(ViewerCommands):
     # Services and parameters
 
     def services(self) -> list[Service]:
-        """Return the services there are."""
         return [service for _, _, service in self._services.values()]
 
     async def call(self, viewer: Subscriber, service_id: int, payload: bytes) -> bytes:
-        """Carry out a call; raise Refused or BusError."""
         if service_id not in self._services:
             raise Unsupported(f"there is no service {service_id}")
         robot, what, service = self._services[service_id]
@@ -236,9 +233,8 @@ class RobotCommands(ViewerCommands):
             await self._stop([robot] if robot else sorted(self._robots))
         elif what == LATCH:
             self._stopped([robot] if robot else sorted(self._robots))
-            _raise_first(
-                await self._fleet.latch([robot] if robot else None, reason if isinstance(reason, str) else None)
-            )
+            why = reason if isinstance(reason, str) else None
+            _raise_first(await self._fleet.latch([robot] if robot else None, why))
         else:
             self._may(viewer)
             if robot:
@@ -269,7 +265,6 @@ class RobotCommands(ViewerCommands):
         await self._pilot(viewer, robot).set_mode(mode)
 
     async def left(self, viewer: Subscriber) -> None:
-        """Release all robots of a viewer that is gone."""
         gone = [key for key in self._pilots if key[0] is viewer]
         await asyncio.gather(*(self._pilots.pop(key).close() for key in gone))
 

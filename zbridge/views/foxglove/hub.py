@@ -1,18 +1,18 @@
 """The channels that viewers are offered, and who subscribed to which. Sans-IO.
 
-Work on demand: the source is notified when the first viewer subscribes to a channel and when the last one leaves it,
-and publishes what is wanted only. The last message of a channel that keeps it is shown to whoever subscribes later.
+Work on demand: the source is notified when a viewer subscribes to a channel and when the last one leaves it, and
+publishes what is wanted only. The last message of a channel that keeps it is shown to whoever subscribes later.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Protocol
 
 import msgspec
 
 from zbridge.views.foxglove import replies
-from zbridge.views.foxglove.replies import StatusLevel
 from zbridge.views.pictures import ViewerChannel
 
 CHANNELS = 8192
@@ -44,32 +44,29 @@ class Subscriber(Protocol):
         """Send parameters, where the viewer watches them."""
 
 
-class _Offer:
-    def __init__(self, channel_id: int, channel: ViewerChannel) -> None:
-        self.id = channel_id
-        self.channel = channel
-        self.entry: msgspec.Raw = replies.channel_entry(channel_id, channel)
-        self.wanted_by: dict[Subscriber, int] = {}
-        self.last: tuple[int, bytes] | None = None
+class _Offer(msgspec.Struct, eq=False):
+    """A channel that viewers are offered. wanted_by: its viewers, and their subscriptions. last: its last message."""
+
+    id: int
+    channel: ViewerChannel
+    entry: msgspec.Raw
+    wanted_by: dict[Subscriber, int] = {}
+    last: tuple[int, bytes] | None = None
 
 
 class Hub:
     """Knows channels and viewers.
 
-    on_wanted: called with a channel when its first viewer comes (True) or its last one goes (False). on_subscribed:
-    called with a channel when a viewer subscribes to one that others had subscribed to already.
+    on_wanted: called with a channel when a viewer subscribes to it (True), and when its last one goes (False).
     """
 
     def __init__(self) -> None:
         self.on_wanted: Callable[[ViewerChannel, bool], None] = lambda channel, wanted: None
-        self.on_subscribed: Callable[[ViewerChannel, Subscriber, int], None] = lambda channel, viewer, subscription: (
-            None
-        )
         self.viewers: set[Subscriber] = set()
         self._offers: dict[int, _Offer] = {}
         self._by_topic: dict[str, _Offer] = {}
         self._warnings: dict[str, str] = {}
-        self._next_id = 1
+        self._ids = itertools.count(1)
 
     def __repr__(self) -> str:
         return f"<Hub of {len(self._offers)} channels, {len(self.viewers)} viewers>"
@@ -85,8 +82,8 @@ class Hub:
             if len(self._offers) >= CHANNELS:
                 left_out += 1
                 continue
-            offer = _Offer(self._next_id, channel)
-            self._next_id += 1
+            number = next(self._ids)
+            offer = _Offer(number, channel, replies.channel_entry(number, channel))
             self._offers[offer.id] = self._by_topic[channel.topic] = offer
             new.append(offer.entry)
         if new:
@@ -103,7 +100,7 @@ class Hub:
             if offer.wanted_by:
                 self.on_wanted(offer.channel, False)
         if gone:
-            self.say(replies.unadvertise([offer.id for offer in gone]))
+            self.say(replies.text("unadvertise", channelIds=[offer.id for offer in gone]))
 
     def publish(self, topic: str, stamp_ns: int, payload: bytes) -> None:
         """Show a message to the viewers of a channel."""
@@ -126,13 +123,12 @@ class Hub:
             return
         if text is None:
             del self._warnings[name]
-            self.say(replies.remove_status([name]))
+            self.say(replies.text("removeStatus", statusIds=[name]))
         else:
             self._warnings[name] = text
-            self.say(replies.status(StatusLevel.WARNING, text, name))
+            self.say(replies.warning(text, name))
 
     def parameters_changed(self, values: Mapping[str, Any]) -> None:
-        """Tell the viewers that watch these parameters."""
         for viewer in self.viewers:
             viewer.parameters_changed(values)
 
@@ -148,7 +144,7 @@ class Hub:
         if self._offers:
             viewer.say(replies.advertise(offer.entry for offer in self._offers.values()))
         for name, text in self._warnings.items():
-            viewer.say(replies.status(StatusLevel.WARNING, text, name))
+            viewer.say(replies.warning(text, name))
 
     def leave(self, viewer: Subscriber) -> None:
         """End a viewer's subscriptions; idempotent."""
@@ -161,18 +157,13 @@ class Hub:
         offer = self._offers.get(channel_id)
         if offer is None:
             return False
-        first = not offer.wanted_by
         offer.wanted_by[viewer] = subscription
-        if first:
-            self.on_wanted(offer.channel, True)
-        else:
-            if offer.last is not None:
-                viewer.show(subscription, replies.message_data(subscription, *offer.last))
-            self.on_subscribed(offer.channel, viewer, subscription)
+        if offer.last is not None:
+            viewer.show(subscription, replies.message_data(subscription, *offer.last))
+        self.on_wanted(offer.channel, True)
         return True
 
     def unsubscribe(self, viewer: Subscriber, channel_id: int) -> None:
-        """End one subscription of a viewer."""
         offer = self._offers.get(channel_id)
         if offer is not None:
             self._leave(viewer, offer)

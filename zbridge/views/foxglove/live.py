@@ -24,7 +24,7 @@ from zbridge.views.foxglove.hub import Hub
 from zbridge.views.foxglove.source import ViewerSource
 from zbridge.views.live_robots import ROBOTS, OnDemandSubscriptions, read_payload, watch_robots
 from zbridge.views.pictures import FoxglovePictures, ViewerChannel, channels_of, sources_of
-from zbridge.views.schemas import Schema, json_schema
+from zbridge.views.schemas import json_schema
 
 SENSORS = 1024
 """Most sensors of one robot that have a channel."""
@@ -36,7 +36,6 @@ _OFFERED = tuple(
     if isinstance(topic, Topic) and topic.delivery in (topics.Delivery.STREAM, topics.Delivery.STATE)
 )
 """The paths that every robot may have."""
-
 _SWITCHES = (topics.LIDAR, topics.CAMERA)
 """What robots tell of their parameters."""
 _ASK_S = 0.3
@@ -46,9 +45,6 @@ class NamedReading(Reading, frozen=True):
     """A reading, and the name of its sensor."""
 
     sensor: str = ""
-
-
-_encode = msgspec.json.Encoder().encode
 
 
 class _Shown:
@@ -88,7 +84,6 @@ class LiveSource(ViewerSource):
         return f"<LiveSource {self._realm}, {len(self._shown)} robots>"
 
     def start(self) -> None:
-        """Begin to watch for robots."""
         self._handles = [
             watch_robots(self._bus, self._realm, self._robots, self._on_gateway),
             self._bus.subscribe(f"{self._realm}/*/{topics.DEVICES.path}", self._on_devices, history=True),
@@ -118,14 +113,14 @@ class LiveSource(ViewerSource):
     def _show(self, name: str) -> None:
         self._shown[name] = shown = _Shown(KeySpace(self._realm, name), self._subscribe)
         channels = {channel.path: channel for path in _OFFERED for channel in channels_of(name, path)}
-        channels[_SENSORS] = ViewerChannel(f"/{name}/{_SENSORS}", _SENSORS, _sensors_schema())
+        channels[_SENSORS] = ViewerChannel(f"/{name}/{_SENSORS}", _SENSORS, json_schema(NamedReading))
         self._offer(shown, channels.values())
         self._commands.robot_came(name)
 
     def _hide(self, name: str) -> None:
         shown = self._shown[name]
         self._commands.robot_left(name)
-        self.hub.warn(_latched(name), None)
+        self.hub.warn(f"latched.{name}", None)
         self.hub.withdraw([channel.topic for channel in shown.offered.values()])
         del self._shown[name]
         shown.subscribed.need(set())
@@ -138,21 +133,19 @@ class LiveSource(ViewerSource):
     def _on_devices(self, sample: Sample) -> None:
         """Offer a channel for each sensor that a robot announces."""
         split = split_key(sample.key)
-        if split is None or (shown := self._shown.get(split[1])) is None:
-            return
-        devices = read_payload(Devices, sample.payload, self._malformed)
-        for device in devices.devices if devices is not None else ():
-            self._found(shown, topics.SENSOR(device.name).path)
+        shown = self._shown.get(split[1]) if split is not None else None
+        if shown is not None and (devices := read_payload(Devices, sample.payload, self._malformed)) is not None:
+            for device in devices.devices:
+                self._found(shown, topics.SENSOR(device.name).path)
 
     def _on_control(self, sample: Sample) -> None:
-        """Warn of a robot that is latched."""
         split = split_key(sample.key)
         if split is None or split[1] not in self._shown:
             return
         control = read_payload(Control, sample.payload, self._malformed)
         if control is not None:
             text = "; ".join(latch.described for latch in control.latches)
-            self.hub.warn(_latched(split[1]), f"{split[1]}: {text}" if text else None)
+            self.hub.warn(f"latched.{split[1]}", f"{split[1]}: {text}" if text else None)
 
     def _found(self, shown: _Shown, path: str) -> None:
         if path not in shown.offered and shown.sensors < SENSORS:
@@ -166,18 +159,15 @@ class LiveSource(ViewerSource):
         if shown is None:
             return
         (shown.wanted.add if wanted else shown.wanted.discard)(channel.path)
-        needed = {source for path in shown.wanted for source in self._sources(shown.offered[path])}
-        if _ALL_SENSORS in needed:
-            needed = {source for source in needed if source == _ALL_SENSORS or not source.startswith("sensor/")}
+        needed = {source for path in shown.wanted for source in sources_of(shown.offered[path])}
+        if _SENSORS in shown.wanted:
+            needed = {source for source in needed - {_SENSORS} if not source.startswith("sensor/")} | {_ALL_SENSORS}
         shown.subscribed.need(needed)
 
     def _subscribe(self, shown: _Shown, source: str) -> Handle:
         topic = topics.find(source)
         history = topic is not None and topic.qos.keeps_last
         return self._bus.subscribe(shown.keys.key(source), lambda sample: self._receive(shown, sample), history=history)
-
-    def _sources(self, channel: ViewerChannel) -> tuple[str, ...]:
-        return (_ALL_SENSORS,) if channel.path == _SENSORS else sources_of(channel)
 
     def _receive(self, shown: _Shown, sample: Sample) -> None:
         path = shown.keys.path(sample.key)
@@ -191,14 +181,13 @@ class LiveSource(ViewerSource):
         if isinstance(message, Reading) and _SENSORS in shown.wanted:
             self._found(shown, path)
             named = NamedReading(**msgspec.structs.asdict(message), sensor=unescape(path.rpartition("/")[2]))
-            self.hub.publish(f"/{shown.keys.robot}/{_SENSORS}", now_ns, _encode(named))
+            self.hub.publish(f"/{shown.keys.robot}/{_SENSORS}", now_ns, msgspec.json.encode(named))
         for picture in shown.pictures.draw(topic, message, now_ns, shown.wanted):
             self.hub.publish(picture.channel.topic, now_ns, picture.payload)
 
     # Parameters
 
     async def parameters(self, names: tuple[str, ...], *, ask: bool = True) -> Mapping[str, Any]:
-        """Return the values of parameters, the robots' own where they tell them."""
         if ask and not self._watching:
             with contextlib.suppress(BusError):
                 for topic in _SWITCHES:
@@ -224,12 +213,3 @@ class LiveSource(ViewerSource):
         split = split_key(sample.key)
         if split is not None and (switch := read_payload(Switch, sample.payload, self._malformed)) is not None:
             self._commands.noted(split[1], split[2], switch.on)
-
-
-def _latched(robot: str) -> str:
-    """Name the warning of a robot that is latched."""
-    return f"latched.{robot}"
-
-
-def _sensors_schema() -> Schema:
-    return json_schema(NamedReading)

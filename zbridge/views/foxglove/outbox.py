@@ -39,13 +39,11 @@ class ViewerOutbox:
         return len(self._controls) + len(self._order)
 
     def say(self, message: str | bytes) -> None:
-        """Add an answer or news."""
         self._controls.append(message)
         self._control_bytes += len(message)
         self.overrun |= len(self._controls) > CONTROLS or self._control_bytes > CONTROL_BYTES
 
     def show(self, subscription: int, message: bytes) -> None:
-        """Add a message of a channel."""
         queue = self._queues.get(subscription)
         if queue is None:
             queue = self._queues[subscription] = deque()

@@ -12,20 +12,10 @@ import msgspec
 
 from zbridge.views.foxglove.requests import ServiceCall
 from zbridge.views.pictures import ViewerChannel
-from zbridge.views.schemas import Schema
 
 SUBPROTOCOL = "foxglove.sdk.v1"
 _S_NS = 1_000_000_000
-
-
-class StatusLevel(IntEnum):
-    """How bad the news of a ``status`` is."""
-
-    INFO = 0
-    WARNING = 1
-    ERROR = 2
-
-
+_WARNING = 1
 _MESSAGE = struct.Struct("<BIQ")
 _REPLY = struct.Struct("<BIII")
 _STATE = struct.Struct("<BBQfBI")
@@ -43,6 +33,19 @@ class Service(msgspec.Struct, frozen=True):
     response: Mapping[str, Any]
 
 
+class PlaybackStatus(IntEnum):
+    """What becomes of a recording."""
+
+    PLAYING = 0
+    PAUSED = 1
+    ENDED = 3
+
+
+def text(op: str, **fields: Any) -> str:
+    """Write a text message."""
+    return _encode({"op": op, **fields}).decode()
+
+
 def server_info(
     name: str,
     capabilities: Sequence[str],
@@ -51,44 +54,36 @@ def server_info(
     times_ns: tuple[int, int] | None = None,
 ) -> str:
     """Write the first message. times_ns: the first and the last time of a recording."""
-    fields: dict[str, Any] = {
-        "op": "serverInfo",
-        "name": name,
-        "capabilities": capabilities,
-        "supportedEncodings": ["json"] if "clientPublish" in capabilities or "services" in capabilities else [],
-        "metadata": metadata,
-        "sessionId": session_id,
-    }
-    if times_ns is not None:
-        fields |= {"dataStartTime": _time_of(times_ns[0]), "dataEndTime": _time_of(times_ns[1])}
-    return _text(fields)
+    times = zip(("dataStartTime", "dataEndTime"), times_ns or (), strict=False)
+    return text(
+        "serverInfo",
+        name=name,
+        capabilities=capabilities,
+        supportedEncodings=["json"] if {"clientPublish", "services"} & set(capabilities) else [],
+        metadata=metadata,
+        sessionId=session_id,
+        **{key: {"sec": at_ns // _S_NS, "nsec": at_ns % _S_NS} for key, at_ns in times},
+    )
 
 
 def channel_entry(channel_id: int, channel: ViewerChannel) -> msgspec.Raw:
     """Write a channel as ``advertise`` lists it; a binary schema as base64."""
     schema = channel.schema
-    return msgspec.Raw(
-        _encode(
-            {
-                "id": channel_id,
-                "topic": channel.topic,
-                "encoding": schema.message_encoding,
-                "schemaName": schema.name,
-                "schemaEncoding": schema.encoding,
-                "schema": _schema_text(schema),
-            }
-        )
-    )
+    is_binary = schema.encoding in ("protobuf", "flatbuffer")
+    fields = {
+        "id": channel_id,
+        "topic": channel.topic,
+        "encoding": schema.message_encoding,
+        "schemaName": schema.name,
+        "schemaEncoding": schema.encoding,
+        "schema": base64.b64encode(schema.data).decode() if is_binary else schema.data.decode("utf-8", "replace"),
+    }
+    return msgspec.Raw(_encode(fields))
 
 
 def advertise(entries: Iterable[msgspec.Raw]) -> str:
     """Offer channels."""
-    return _text({"op": "advertise", "channels": list(entries)})
-
-
-def unadvertise(channel_ids: Sequence[int]) -> str:
-    """Withdraw channels."""
-    return _text({"op": "unadvertise", "channelIds": channel_ids})
+    return text("advertise", channels=list(entries))
 
 
 def message_data(subscription_id: int, log_ns: int, payload: bytes) -> bytes:
@@ -96,15 +91,9 @@ def message_data(subscription_id: int, log_ns: int, payload: bytes) -> bytes:
     return _MESSAGE.pack(1, subscription_id, log_ns) + payload
 
 
-def status(level: StatusLevel, text: str, name: str | None = None) -> str:
-    """Tell people something. name: of what holds until :func:`remove_status`, or until it is told anew."""
-    named = {"id": name} if name is not None else {}
-    return _text({"op": "status", "level": int(level), "message": text} | named)
-
-
-def remove_status(names: Sequence[str]) -> str:
-    """Take back what does not hold any more."""
-    return _text({"op": "removeStatus", "statusIds": names})
+def warning(message: str, name: str | None = None) -> str:
+    """Tell people something. name: of what holds until ``removeStatus``, or until it is told anew."""
+    return text("status", level=_WARNING, message=message, **({"id": name} if name is not None else {}))
 
 
 def advertise_services(services: Iterable[Service]) -> str:
@@ -119,12 +108,7 @@ def advertise_services(services: Iterable[Service]) -> str:
         }
         for service in services
     ]
-    return _text({"op": "advertiseServices", "services": entries})
-
-
-def unadvertise_services(service_ids: Sequence[int]) -> str:
-    """Withdraw services."""
-    return _text({"op": "unadvertiseServices", "serviceIds": service_ids})
+    return text("advertiseServices", services=entries)
 
 
 def service_response(call: ServiceCall, payload: bytes) -> bytes:
@@ -132,31 +116,20 @@ def service_response(call: ServiceCall, payload: bytes) -> bytes:
     return _REPLY.pack(3, call.service_id, call.call_id, 4) + b"json" + payload
 
 
-def service_failure(call: ServiceCall, text: str) -> str:
+def service_failure(call: ServiceCall, why: str) -> str:
     """Say why a call was not carried out."""
-    return _text({"op": "serviceCallFailure", "serviceId": call.service_id, "callId": call.call_id, "message": text})
+    return text("serviceCallFailure", serviceId=call.service_id, callId=call.call_id, message=why)
 
 
 def parameter_values(values: Mapping[str, Any], request_id: str | None = None) -> str:
     """Tell parameters. request_id: of the request that is answered."""
-    fields: dict[str, Any] = {
-        "op": "parameterValues",
-        "parameters": [{"name": name, "value": value} for name, value in values.items()],
-    }
-    return _text(fields | ({"id": request_id} if request_id is not None else {}))
+    listed = [{"name": name, "value": value} for name, value in values.items()]
+    return text("parameterValues", parameters=listed, **({"id": request_id} if request_id is not None else {}))
 
 
 def time(now_ns: int) -> bytes:
     """Tell the time of a recording, Unix nanoseconds."""
     return _TIME.pack(2, now_ns)
-
-
-class PlaybackStatus(IntEnum):
-    """What becomes of a recording."""
-
-    PLAYING = 0
-    PAUSED = 1
-    ENDED = 3
 
 
 def playback_state(status: PlaybackStatus, now_ns: int, speed: float, *, sought: bool, request_id: str) -> bytes:
@@ -165,21 +138,10 @@ def playback_state(status: PlaybackStatus, now_ns: int, speed: float, *, sought:
     return _STATE.pack(5, status, now_ns, speed, sought, len(encoded)) + encoded
 
 
-def _text(fields: Mapping[str, Any]) -> str:
-    return _encode(fields).decode()
-
-
-def _time_of(stamp_ns: int) -> dict[str, int]:
-    seconds, nanoseconds = divmod(stamp_ns, _S_NS)
-    return {"sec": seconds, "nsec": nanoseconds}
-
-
-def _schema_text(schema: Schema) -> str:
-    if schema.encoding in ("protobuf", "flatbuffer"):
-        return base64.b64encode(schema.data).decode()
-    return schema.data.decode("utf-8", "replace")
-
-
 def _json_schema(name: str, schema: Mapping[str, Any]) -> dict[str, str]:
-    text = _encode(schema).decode()
-    return {"encoding": "json", "schemaName": name, "schemaEncoding": "jsonschema", "schema": text}
+    return {
+        "encoding": "json",
+        "schemaName": name,
+        "schemaEncoding": "jsonschema",
+        "schema": _encode(schema).decode(),
+    }

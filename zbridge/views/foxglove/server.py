@@ -27,12 +27,11 @@ from zbridge.errors import ConfigError
 from zbridge.fleet.printable import shown
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
-from zbridge.views.foxglove.admission import Admitted, Policy, UpgradeRequest, ViewerAdmission
+from zbridge.views.foxglove.admission import Admitted, Policy, ViewerAdmission
 from zbridge.views.foxglove.commands import RobotCommands
 from zbridge.views.foxglove.hub import Hub
 from zbridge.views.foxglove.live import LiveSource
-from zbridge.views.foxglove.playback import Playback
-from zbridge.views.foxglove.recording import IndexedRecording
+from zbridge.views.foxglove.playback import IndexedRecording, Playback
 from zbridge.views.foxglove.replies import SUBPROTOCOL
 from zbridge.views.foxglove.settings import FoxglovePlan
 from zbridge.views.foxglove.source import ViewerSource
@@ -73,7 +72,7 @@ class ViewerServer:
         """Connections, those in their handshake too."""
         self.refused: Counter[str] = Counter()
         self._source = source
-        self._admission = ViewerAdmission(policy)
+        self.admission = ViewerAdmission(policy)
         self._metrics = metrics
         self._tls = tls
         self._numbers = 0
@@ -84,21 +83,16 @@ class ViewerServer:
     @contextlib.asynccontextmanager
     async def serve(self) -> AsyncIterator[None]:
         """Serve viewers while the context lasts; ``address`` has the port then. Raise ConfigError for a bad address."""
-        owner_of_connections = self
-
-        class Guarded(_Guarded):
-            owner = owner_of_connections
-
-        tls: dict[str, Any] = {"ssl_handshake_timeout": HANDSHAKE_S} if self._tls is not None else {}
         try:
             server = await serve(
                 self._serve,
                 self.address.host,
                 self.address.port,
                 ssl=self._tls,
+                ssl_handshake_timeout=HANDSHAKE_S if self._tls is not None else None,
                 process_request=self._admit,
                 subprotocols=[Subprotocol(SUBPROTOCOL)],
-                create_connection=Guarded,
+                create_connection=type("Guarded", (_Guarded,), {"owner": self}),
                 compression=None,  # scans hardly shrink, and a core is worth more
                 server_header=None,
                 logger=_silent,
@@ -109,7 +103,6 @@ class ViewerServer:
                 close_timeout=CLOSE_S,
                 ping_interval=PING_S,
                 ping_timeout=PING_S,
-                **tls,
             )
         except OSError as error:
             raise ConfigError(f"--listen {self.address}: {error.strerror or error}") from error
@@ -129,31 +122,27 @@ class ViewerServer:
         self.refused[reason] += 1
         log.debug("%s turned away: %s %s", host, reason, shown(what))
 
-    def early_refusal(self, host: str) -> str | None:
-        """Return why a connection is closed at once."""
-        return self._admission.refusal(host, self.open, asyncio.get_running_loop().time())
-
     def _admit(self, connection: ServerConnection, request: HttpRequest) -> Response | None:
         """Turn a handshake away, or note what the viewer is."""
         try:
             offered = [
                 name for line in request.headers.get_all("Sec-WebSocket-Protocol") for name in parse_subprotocol(line)
             ]
-            asked = UpgradeRequest(request.path, request.headers.get_all("Origin"), offered)
-            decision = self._admission.admit(asked, _host(connection), len(self.viewers))
+            origins = request.headers.get_all("Origin")
+            decision = self.admission.admit(request.path, origins, offered, _host(connection), len(self.viewers))
         except (InvalidHeader, ValueError):
             self.turn_away("malformed", _host(connection))
             return connection.respond(http.HTTPStatus.BAD_REQUEST, "malformed\n")
         if isinstance(decision, Admitted):
             connection.admitted = decision  # type: ignore[attr-defined]
             return None
-        self.turn_away(decision.reason, _host(connection), " ".join(asked.origins))
+        self.turn_away(decision.reason, _host(connection), " ".join(origins))
         return connection.respond(decision.status, decision.text + "\n")
 
     async def _serve(self, connection: ServerConnection) -> None:
         assert isinstance(connection, _Guarded)
         admitted: Admitted = connection.admitted  # type: ignore[attr-defined]
-        policy = self._admission.policy
+        policy = self.admission.policy
         if len(self.viewers) >= policy.viewers:  # others came during its handshake
             self.turn_away("full", _host(connection))
             return
@@ -201,7 +190,7 @@ class _Guarded(ServerConnection):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         peer: Any = transport.get_extra_info("peername")
         host = str(peer[0]) if peer else ""
-        refused = self.owner.early_refusal(host)
+        refused = self.owner.admission.refusal(host, self.owner.open, asyncio.get_running_loop().time())
         if refused is not None:
             self.owner.turn_away(refused, host)
             transport.abort()  # type: ignore[attr-defined]

@@ -16,9 +16,9 @@ from typing import Any, Protocol
 from zbridge.errors import BusError, ProtocolError, Refused, Unsupported, describe
 from zbridge.fleet.printable import shown
 from zbridge.protocol.rate_limit import RateLimit
+from zbridge.tasks import Tasks, race
 from zbridge.views.foxglove import replies, requests
 from zbridge.views.foxglove.outbox import ViewerOutbox
-from zbridge.views.foxglove.replies import StatusLevel
 from zbridge.views.foxglove.requests import ClientChannel, ServiceCall
 from zbridge.views.foxglove.source import ViewerSource
 
@@ -84,7 +84,7 @@ class Viewer:
         """The channel of each subscription."""
         self._subscribed: set[int] = set()
         self._published: dict[int, ClientChannel] = {}
-        self._calls: set[asyncio.Task[None]] = set()
+        self._calls = Tasks()
         self._watched: set[str] | None = None
         """Names of the parameters it watches: an empty set for all, None for none."""
 
@@ -99,22 +99,15 @@ class Viewer:
         if services:
             self.say(replies.advertise_services(services))
         self._source.greet(self)
-        work = [asyncio.create_task(part()) for part in (self._read, self._write, self._watch_writing)]
         try:
-            done, _ = await asyncio.wait(work, return_when=asyncio.FIRST_COMPLETED)
-            for task in done:
-                task.result()
+            await race(self._read(), self._write(), self._watch_writing())
         finally:
-            work += self._calls
-            for task in work:
-                task.cancel()
-            await asyncio.gather(*work, return_exceptions=True)
+            await self._calls.end()
             await self._leave()
 
     # To the viewer
 
     def say(self, message: str | bytes) -> None:
-        """Send an answer or news."""
         self._outbox.say(message)
         self._filled.set()
 
@@ -125,17 +118,15 @@ class Viewer:
             self._filled.set()
 
     def ended(self, subscription: int) -> None:
-        """Forget a subscription: its channel is withdrawn."""
         self._subscribed.discard(self._channels.pop(subscription, -1))
         self._outbox.forget(subscription)
 
     def warn(self, text: str) -> None:
         """Tell the person that something was not done, a few times a second at most."""
         if self._warned.take(self._clock()):
-            self.say(replies.status(StatusLevel.WARNING, shown(text)))
+            self.say(replies.warning(shown(text)))
 
     def parameters_changed(self, values: Mapping[str, Any]) -> None:
-        """Tell parameters that the viewer watches."""
         if self._watched is None:
             return
         watched = {name: value for name, value in values.items() if not self._watched or name in self._watched}
@@ -199,17 +190,16 @@ class Viewer:
 
     def _subscribe(self, request: requests.Subscribe) -> None:
         for wanted in request.subscriptions:
-            if wanted.id in self._channels or wanted.channel_id in self._subscribed:
-                self.refuse(
-                    Unsupported(f"channel {wanted.channel_id} or subscription {wanted.id} is subscribed already")
-                )
+            channel_id = wanted.channel_id
+            if wanted.id in self._channels or channel_id in self._subscribed:
+                self.refuse(Unsupported(f"channel {channel_id} or subscription {wanted.id} is subscribed already"))
             elif len(self._channels) >= SUBSCRIPTIONS:
                 self.refuse(Unsupported(f"more than {SUBSCRIPTIONS} subscriptions"))
-            elif not self._hub.subscribe(self, wanted.id, wanted.channel_id):
-                self.refuse(Unsupported(f"there is no channel {wanted.channel_id}"))
+            elif not self._hub.subscribe(self, wanted.id, channel_id):
+                self.refuse(Unsupported(f"there is no channel {channel_id}"))
             else:
-                self._channels[wanted.id] = wanted.channel_id
-                self._subscribed.add(wanted.channel_id)
+                self._channels[wanted.id] = channel_id
+                self._subscribed.add(channel_id)
 
     def _unsubscribe(self, request: requests.Unsubscribe) -> None:
         for subscription in request.subscription_ids:
@@ -229,8 +219,7 @@ class Viewer:
 
     def _unadvertise(self, request: requests.Unadvertise) -> None:
         for channel_id in request.channel_ids:
-            channel = self._published.pop(channel_id, None)
-            if channel is not None:
+            if (channel := self._published.pop(channel_id, None)) is not None:
                 self._source.commands.unpublished(self, channel)
 
     def _set(self, request: requests.SetParameters) -> None:
@@ -261,9 +250,7 @@ class Viewer:
             work.close()
             self.counts["refused"] += 1
             return False
-        task = asyncio.create_task(work)
-        self._calls.add(task)
-        task.add_done_callback(self._calls.discard)
+        self._calls.start(work)
         return True
 
     async def _call(self, call: ServiceCall) -> None:
@@ -284,9 +271,8 @@ class Viewer:
             except (Refused, BusError, ProtocolError) as error:
                 self.refuse(error)
         if request.id is not None:
-            await self._send_parameters(
-                tuple(parameter.name for parameter in request.parameters), request.id, ask=False
-            )
+            names = tuple(parameter.name for parameter in request.parameters)
+            await self._send_parameters(names, request.id, ask=False)
 
     async def _send_parameters(self, names: tuple[str, ...], request_id: str | None, *, ask: bool = True) -> None:
         self.say(replies.parameter_values(await self._source.parameters(names, ask=ask), request_id))
@@ -302,8 +288,7 @@ class Viewer:
             log.error("%s left: %s", self.name, describe(error))
 
 
-_Handler = Callable[[Viewer, Any], object]
-_HANDLERS: Mapping[type, _Handler] = {
+_HANDLERS: Mapping[type, Callable[[Viewer, Any], object]] = {
     requests.Subscribe: Viewer._subscribe,
     requests.Unsubscribe: Viewer._unsubscribe,
     requests.Advertise: Viewer._advertise,

@@ -46,7 +46,7 @@ class RecordPlan(msgspec.Struct, frozen=True):
         """The key expressions that are subscribed to; no key matches two of them."""
         if self.keys is not None:
             return (self.keys,)
-        parts = ["**", "@cmd/**", *(["@wire/**"] if self.wire else [])]
+        parts = ("**", "@cmd/**", *(("@wire/**",) if self.wire else ()))
         below = [f"{self.realm}/{robot}/{part}" for robot in self.robots or ("*",) for part in parts]
         if not self.robots:
             below[0] = f"{self.realm}/**"  # as access rules allow it
@@ -75,12 +75,12 @@ class BusCapture:
 
     def open(self) -> None:
         """Subscribe."""
-        for key_expr in self._plan.key_exprs:
-            self._handles.append(self._bus.subscribe(key_expr, self._store, lane=self._receive))
-        realm = self._plan.realm
-        for name in self._plan.names:
-            self._handles.append(self._bus.watch_alive(f"{realm}/{name}/@alive/*", self._on_token))
-        if self._plan.names:
+        bus, plan = self._bus, self._plan
+        self._handles = [
+            *(bus.subscribe(key_expr, self._store, lane=self._receive) for key_expr in plan.key_exprs),
+            *(bus.watch_alive(f"{plan.realm}/{name}/@alive/*", self._on_token) for name in plan.names),
+        ]
+        if plan.names:
             self._sessions = asyncio.get_running_loop().create_task(self._query_sessions())
 
     def close(self) -> None:

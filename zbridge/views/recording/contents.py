@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
 MSGPACK, OCTETS, JSON = "msgpack", "octet-stream", "json"
 SENT = "/@sent"
 """Ends the topic that stands beside a command's."""
-_TRANSPORT = "transport"
 
 
 class Sent(FleetMessage, frozen=True):
@@ -52,12 +52,12 @@ class Alive(FleetMessage, frozen=True):
 
 
 class ChannelKind(msgspec.Struct, frozen=True):
-    """A channel: what its messages are. metadata: pairs that tell channels of one topic apart."""
+    """A channel: what its messages are. datagram: raw frames that went by datagram."""
 
     topic: str
     encoding: str
     schema: Schema | None = None
-    metadata: tuple[tuple[str, str], ...] = ()
+    datagram: bool = False
 
 
 def message_of(key: str) -> type[FleetMessage] | None:
@@ -84,7 +84,7 @@ def is_wire(key: str) -> bool:
 def channel_of(key: str, *, datagram: bool = False) -> ChannelKind:
     """Describe the channel of a key."""
     if is_wire(key):
-        return ChannelKind(key, OCTETS, None, ((_TRANSPORT, "datagram"),) if datagram else ())
+        return ChannelKind(key, OCTETS, datagram=datagram)
     message = message_of(key)
     return ChannelKind(key, MSGPACK, schema_of(message) if message is not None else None)
 
@@ -130,10 +130,6 @@ class Pictures:
         """Messages that could not be read."""
         self._make = FoxglovePictures
         self._robots: dict[str, FoxglovePictures] = {}
-        self._kinds: dict[ViewerChannel, ChannelKind] = {}
-
-    def __repr__(self) -> str:
-        return f"<Pictures of {len(self._robots)} robots>"
 
     def draw(self, key: str, topic: Topic, payload: bytes, now_ns: int) -> Iterator[tuple[ChannelKind, int, bytes]]:
         """Yield the pictures of a message: channel, publish time, payload."""
@@ -151,14 +147,12 @@ class Pictures:
             self.undrawn += 1
             return
         for picture in robot.draw(topic, message, now_ns):
-            yield self._kind(picture.channel), picture.stamp_ns, picture.payload
+            yield _drawn_on(picture.channel), picture.stamp_ns, picture.payload
 
-    def _kind(self, channel: ViewerChannel) -> ChannelKind:
-        kind = self._kinds.get(channel)
-        if kind is None:
-            schema = channel.schema
-            kind = self._kinds[channel] = ChannelKind(channel.topic, schema.message_encoding, schema)
-        return kind
+
+@lru_cache(maxsize=ROBOTS * 16)
+def _drawn_on(channel: ViewerChannel) -> ChannelKind:
+    return ChannelKind(channel.topic, channel.schema.message_encoding, channel.schema)
 
 
 _SECRET = re.compile(r"pass|secret|token|key|credential|private|auth", re.IGNORECASE)

@@ -30,8 +30,13 @@ TABLES = 10_000
 """Most tables of an export."""
 ARRAY_BYTES = 2**31
 """Bytes of all arrays of an export, which are in memory."""
+_CHOOSE = "choose some by --keys, --from and --to"
 _TIMES = ("log_ns", "publish_ns")
-_ARRAY_TIMES = ("log_ns", "stamp_ns")
+_ARRAYS: dict[type[FleetMessage], tuple[str, ...]] = {
+    Pose: ("x", "y", "heading"),
+    Scan: ("angle_min", "angle_increment"),
+}
+"""The numbers of which an array is made."""
 
 
 class Export(msgspec.Struct):
@@ -66,7 +71,7 @@ def export_tables(path: Path, folder: Path, selection: Selection) -> Export:
             done.messages += 1
     finally:
         tables.close()
-    done.files = tables.count
+    done.files = len(tables.topics)
     return done
 
 
@@ -78,14 +83,12 @@ def export_arrays(path: Path, output: Path, selection: Selection) -> Export:
     """
     import numpy as np
 
-    done = Export()
-    poses: dict[str, _Columns] = {}
-    scans: dict[str, _Columns] = {}
-    size = 0
+    done, size = Export(), 0
+    found: dict[str, dict[str, _Columns]] = {"pose": {}, "scan": {}}
     for message in _chosen(path, selection, done):
         split = split_key(message.channel.topic)
         kind = message_of(message.channel.topic)
-        if split is None or message.channel.encoding != MSGPACK or kind not in (Pose, Scan):
+        if split is None or message.channel.encoding != MSGPACK or kind is None or kind not in _ARRAYS:
             continue
         try:
             decoded = payloads.decode(kind, message.data)
@@ -94,15 +97,15 @@ def export_arrays(path: Path, output: Path, selection: Selection) -> Export:
             continue
         size += len(message.data) + 40
         if size > ARRAY_BYTES:
-            raise ConfigError(
-                f"more than {ARRAY_BYTES} bytes of scans and poses: choose some by --keys, --from and --to"
-            )
-        (poses if kind is Pose else scans).setdefault(split[1], _Columns(kind)).add(message, decoded)
+            raise ConfigError(f"more than {ARRAY_BYTES} bytes of scans and poses: {_CHOOSE}")
+        found[kind.__name__.lower()].setdefault(split[1], _Columns(_ARRAYS[kind])).add(message, decoded)
         done.messages += 1
-    arrays: dict[str, Any] = {}
-    for what, robots in (("pose", poses), ("scan", scans)):
-        for robot, columns in robots.items():
-            arrays |= {f"{robot}/{what}/{name}": values for name, values in columns.arrays(np).items()}
+    arrays: dict[str, Any] = {
+        f"{robot}/{what}/{name}": values
+        for what, robots in found.items()
+        for robot, columns in robots.items()
+        for name, values in columns.arrays(np).items()
+    }
     with output.open("xb") as file:
         np.savez_compressed(file, **arrays)
     done.files = 1
@@ -152,17 +155,15 @@ class _Tables:
     """The tables of an export, of which few are open at a time."""
 
     def __init__(self, folder: Path) -> None:
-        self.count = 0
+        self.topics: set[str] = set()
         self._folder = folder
         self._open: OrderedDict[str, IO[str]] = OrderedDict()
-        self._names: dict[str, tuple[str, ...]] = {}
 
     def write(self, topic: str, names: tuple[str, ...], values: list[Any]) -> None:
-        if topic not in self._names:
-            if self.count >= TABLES:
+        if topic not in self.topics:
+            if len(self.topics) >= TABLES:
                 raise ConfigError(f"more than {TABLES} keys: choose some by --keys")
-            self.count += 1
-            self._names[topic] = names
+            self.topics.add(topic)
             csv.writer(self._file(topic, "x")).writerow((*_TIMES, *names))
         csv.writer(self._file(topic, "a")).writerow(values)
 
@@ -195,29 +196,28 @@ class _Tables:
 class _Columns:
     """The poses or scans of one robot, column by column; scans with fewer points are filled up with NaN."""
 
-    def __init__(self, kind: type[FleetMessage]) -> None:
-        self._times = (array("Q"), array("Q"))
-        names = ("x", "y", "heading") if kind is Pose else ("angle_min", "angle_increment")
+    def __init__(self, names: tuple[str, ...]) -> None:
+        self._times = {"log_ns": array("Q"), "stamp_ns": array("Q")}
         self._columns = {name: array("d") for name in names}
         self._ranges: list[Any] = []
 
     def add(self, message: RecordedMessage, decoded: FleetMessage) -> None:
-        for times, value in zip(self._times, (message.log_ns, message.publish_ns), strict=True):
-            times.append(value)
+        self._times["log_ns"].append(message.log_ns)
+        self._times["stamp_ns"].append(message.publish_ns)
         for name, column in self._columns.items():
             column.append(getattr(decoded, name))
         if isinstance(decoded, Scan):
             self._ranges.append(decoded.ranges)
 
     def arrays(self, np: Any) -> dict[str, np.ndarray]:
-        arrays = {name: np.array(each).astype(np.int64) for name, each in zip(_ARRAY_TIMES, self._times, strict=True)}
+        arrays = {name: np.array(times).astype(np.int64) for name, times in self._times.items()}
         arrays |= {name: np.array(column) for name, column in self._columns.items()}
         return arrays | ({"ranges": self._filled(np)} if self._ranges else {})
 
     def _filled(self, np: Any) -> Any:
         points = max(map(len, self._ranges))
         if points * len(self._ranges) * 4 > ARRAY_BYTES:
-            raise ConfigError(f"more than {ARRAY_BYTES} bytes of scans: choose some by --keys, --from and --to")
+            raise ConfigError(f"more than {ARRAY_BYTES} bytes of scans: {_CHOOSE}")
         filled = np.full((len(self._ranges), points), np.nan, np.float32)
         for row, scan in zip(filled, self._ranges, strict=True):
             row[: len(scan)] = scan

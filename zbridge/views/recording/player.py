@@ -46,7 +46,6 @@ class PlaybackClock:
         return not self.playing and self._at_ns >= self.end_ns
 
     def now_ns(self, now: float) -> int:
-        """Return the time of the recording."""
         if not self.playing:
             return self._at_ns
         return min(self.end_ns, self._at_ns + int((now - self._since) * self.speed * 1e9))
@@ -58,7 +57,6 @@ class PlaybackClock:
         self.playing, self.speed = True, speed
 
     def pause(self, now: float) -> None:
-        """Pause here."""
         self._set(self.now_ns(now), now)
         self.playing = False
 
@@ -119,7 +117,6 @@ class Player:
         return not self._time.playing
 
     def start(self) -> None:
-        """Begin to play."""
         self._thread.start()
 
     def pause(self) -> None:

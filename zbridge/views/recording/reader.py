@@ -11,6 +11,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Callable, Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import IO, Any
 
@@ -31,6 +32,8 @@ TEXT_BYTES = 1024
 SCHEMA_BYTES = 2**20
 TABLES_BYTES = 64 * 2**20
 """Bytes of all channels, schemas and metadata together."""
+DATAGRAM = {"transport": "datagram"}
+"""The metadata of a channel whose raw frames went by datagram; it tells two channels of one topic apart."""
 _HEAD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _CHUNK = struct.Struct("<QQQI")
@@ -42,18 +45,17 @@ class BrokenError(ZbridgeError):
 
 
 class RecordedChannel(msgspec.Struct, frozen=True):
-    """A channel of a file, with its schema's name and encoding."""
+    """A channel of a file, with its schema's name."""
 
     topic: str
     encoding: str
     schema: str = ""
-    schema_encoding: str = ""
     metadata: dict[str, str] = {}
 
     @property
     def datagram(self) -> bool:
         """Whether its raw frames went by datagram."""
-        return self.metadata.get("transport") == "datagram"
+        return DATAGRAM.items() <= self.metadata.items()
 
     def __hash__(self) -> int:
         return hash((self.topic, self.encoding, self.schema))
@@ -80,14 +82,13 @@ class RecordingReader:
         self.fault: str | None = None
         """Why the file could not be read further; None while nothing is wrong."""
         self._file = file
-        self._schemas: dict[int, tuple[str, str]] = {}
+        self._schemas: dict[int, str] = {}
         self._channels: dict[int, RecordedChannel] = {}
         self._tables = 0
 
     def __repr__(self) -> str:
-        return (
-            f"<RecordingReader {len(self._channels)} channels, {self.fault or ('ended' if self.ended else 'reading')}>"
-        )
+        state = self.fault or ("ended" if self.ended else "reading")
+        return f"<RecordingReader {len(self._channels)} channels, {state}>"
 
     def messages(self) -> Iterator[RecordedMessage]:
         """Yield the messages up to the end of the file, or to what cannot be read. Raises OSError."""
@@ -120,7 +121,6 @@ class RecordingReader:
                 self._read_record(opcode, memoryview(content))
 
     def _inner(self, data: bytes) -> Iterator[RecordedMessage]:
-        """Yield the messages of a chunk."""
         view, at, end = memoryview(data), 0, len(data)
         while at < end:
             if end - at < _HEAD.size:
@@ -155,18 +155,17 @@ class RecordingReader:
             read(self, Fields(content))
 
     def _schema(self, fields: Fields) -> None:
-        number, name, encoding = fields.number("<H"), fields.text(), fields.text()
+        number, name, _ = fields.number("<H"), fields.text(), fields.text()
         if fields.number("<I") > SCHEMA_BYTES:
             raise BrokenError(f"schema {name[:40]!r} exceeds {SCHEMA_BYTES} bytes")
-        self._schemas[number] = (name, encoding)
+        self._schemas[number] = name
 
     def _channel(self, fields: Fields) -> None:
         number, schema = fields.number("<H"), fields.number("<H")
         topic, encoding, metadata = fields.text(), fields.text(), fields.pairs()
         if schema and schema not in self._schemas:
             raise BrokenError(f"channel {topic[:40]!r} has schema {schema}, which was not declared")
-        name, schema_encoding = self._schemas.get(schema, ("", ""))
-        channel = RecordedChannel(topic, encoding, name, schema_encoding, metadata)
+        channel = RecordedChannel(topic, encoding, self._schemas.get(schema, ""), metadata)
         known = self._channels.setdefault(number, channel)
         if known != channel:
             raise BrokenError(f"channel {number} is {known.topic[:40]!r}, and then {topic[:40]!r}")
@@ -182,17 +181,12 @@ class Fields:
         self._content = content
         self._at = 0
 
-    def __repr__(self) -> str:
-        return f"<Fields {self._at} of {len(self._content)}>"
-
     def number(self, form: str) -> int:
-        """Read a number of this struct form."""
         size = struct.calcsize(form)
         value: int = struct.unpack(form, self.octets(size))[0]
         return value
 
     def octets(self, size: int) -> memoryview:
-        """Read so many bytes."""
         if size > len(self._content) - self._at:
             raise BrokenError(f"a field of {size} bytes in a record that has {len(self._content) - self._at} more")
         self._at += size
@@ -235,7 +229,12 @@ def _decompressed(content: bytes) -> bytes:
         raise BrokenError(f"a chunk of {size} bytes exceeds {CHUNK_BYTES}")
     if compression not in _DECOMPRESS:
         raise BrokenError(f"a chunk compressed with {compression[:20]!r}, which is unknown")
-    data = _DECOMPRESS[compression](bytes(packed), size)
+    try:
+        data = _DECOMPRESS[compression](bytes(packed), size)
+    except ConfigError:
+        raise
+    except Exception as error:  # whatever the library raises
+        raise BrokenError(f"a chunk that cannot be decompressed: {error}") from error
     if len(data) != size:
         raise BrokenError(f"a chunk of {len(data)} bytes says that it has {size}")
     if checksum and zlib.crc32(data) != checksum:
@@ -244,28 +243,17 @@ def _decompressed(content: bytes) -> bytes:
 
 
 def _zstd(packed: bytes, size: int) -> bytes:
-    zstandard = _library("zstandard")
-    try:
-        with zstandard.ZstdDecompressor(max_window_size=2**27).stream_reader(packed) as stream:
-            data: bytes = stream.read(size + 1)
-            return data
-    except (zstandard.ZstdError, MemoryError) as error:
-        raise BrokenError(f"a chunk that cannot be decompressed: {error}") from error
+    with _library("zstandard").ZstdDecompressor(max_window_size=2**27).stream_reader(packed) as stream:
+        data: bytes = stream.read(size + 1)
+        return data
 
 
 def _lz4(packed: bytes, size: int) -> bytes:
-    lz4 = _library("lz4.frame")
-    decompressor = lz4.LZ4FrameDecompressor()
-    try:
-        data: bytes = decompressor.decompress(packed, size + 1)
-        return data
-    except (RuntimeError, EOFError, MemoryError, ValueError) as error:
-        raise BrokenError(f"a chunk that cannot be decompressed: {error}") from error
+    data: bytes = _library("lz4.frame").LZ4FrameDecompressor().decompress(packed, size + 1)
+    return data
 
 
 def _library(name: str) -> Any:
-    from importlib import import_module
-
     try:
         return import_module(name)
     except ImportError as error:

@@ -38,28 +38,25 @@ _LEASES = 16
 _LATEST_NS = 2**63
 
 
-class _Stamp(msgspec.Struct, gc=False):
+class _StampedFields(msgspec.Struct, gc=False):
     """The fields of a payload that matter to a recording."""
 
     stamp_ns: int = -1
     seq: int = -1
 
 
-_read_stamp = msgspec.msgpack.Decoder(_Stamp).decode
+_read_stamp = msgspec.msgpack.Decoder(_StampedFields).decode
 
 
-class _Track:
-    """One key of the recording. channel: its id in the file of ``number``."""
+class _Track(msgspec.Struct, eq=False):
+    """One key of the recording. channel: its id in the file of ``number``; seq: of its last message."""
 
-    __slots__ = ("channel", "count", "kind", "number", "seq", "topic")
-
-    def __init__(self, kind: ChannelKind, topic: Topic | None) -> None:
-        self.kind = kind
-        self.topic = topic
-        self.number = 0
-        self.channel: int | None = None
-        self.count = 0
-        self.seq = -1
+    kind: ChannelKind
+    topic: Topic | None = None
+    number: int = 0
+    channel: int | None = None
+    count: int = 0
+    seq: int = -1
 
 
 class Recorder:
@@ -133,8 +130,11 @@ class Recorder:
     # The thread
 
     def _run(self) -> None:
+        ending = False
         try:
-            self._work()
+            while not ending:
+                ending = self._ending.wait(PAUSE_S)  # read first: what came before it is still written
+                self._write_batch(self._intake.take())
             self._tape.close()
         except OSError as error:
             self._give_up(error.strerror or str(error))
@@ -142,31 +142,23 @@ class Recorder:
             log.exception("the recording failed")
             self._give_up(f"{type(error).__name__}: {error}")
 
-    def _work(self) -> None:
-        while True:
-            ending = self._ending.wait(PAUSE_S)  # read first: what came before it is still written
-            batch = self._intake.take()
-            self._write_batch(batch)
-            if ending:
-                return
-
     def _write_batch(self, batch: list[Arrival]) -> None:
-        tape = self._tape
         for done, arrival in enumerate(batch):
             try:
                 self._write(arrival)
                 if not done % 256:
-                    tape.keep_time(time.monotonic())
-                    if tape.full(time.monotonic()):
-                        self._next_file(arrival.arrived_ns)
+                    self._keep_time(arrival.arrived_ns)
             except OSError:
                 for lost in batch[done + 1 :]:
-                    tape.unwritten.add(lost.key)
+                    self._tape.unwritten.add(lost.key)
                 raise
+        self._keep_time(time.time_ns())
+
+    def _keep_time(self, now_ns: int) -> None:
         now = time.monotonic()
-        tape.keep_time(now)
-        if tape.full(now):
-            self._next_file(time.time_ns())
+        self._tape.keep_time(now)
+        if self._tape.full(now):
+            self._next_file(now_ns)
 
     def _give_up(self, why: str) -> None:
         ended = self._tape.salvage()
@@ -186,9 +178,8 @@ class Recorder:
     # One message
 
     def _write(self, arrival: Arrival) -> None:
-        track = self._tracks.get((arrival.key, arrival.attachment == topics.WIRE_DATAGRAM)) or self._track(
-            arrival.key, arrival.attachment
-        )
+        known = self._tracks.get((arrival.key, arrival.attachment == topics.WIRE_DATAGRAM))
+        track = known or self._track(arrival.key, arrival.attachment)
         self.messages += 1
         publish_ns = self._write_own(track, arrival)
         topic = track.topic
@@ -198,7 +189,9 @@ class Recorder:
             elif topic.delivery is Delivery.COMMAND:
                 self._write_sender(arrival, publish_ns)
             if self._pictures is not None and topic.delivery is not Delivery.COMMAND:
-                self._draw(topic, arrival)
+                at_ns = arrival.arrived_ns
+                for kind, stamp_ns, data in self._pictures.draw(arrival.key, topic, arrival.payload, at_ns):
+                    self._put(self._extra(kind), at_ns, stamp_ns, data)
 
     def _write_own(self, track: _Track, arrival: Arrival) -> int:
         """Write a message as it was; return its publish time."""
@@ -229,8 +222,10 @@ class Recorder:
         self._tape.write(track.kind.topic, track.channel, log_ns, publish_ns, track.count & 0xFFFFFFFF, data)
 
     def _track(self, key: str, attachment: bytes | None) -> _Track:
-        """Describe a key that is new. Only so many are remembered: a robot may invent names without end."""
+        """Return the channel of a key. Only so many are remembered: a robot may invent names without end."""
         datagram = attachment == topics.WIRE_DATAGRAM
+        if (known := self._tracks.get((key, datagram))) is not None:
+            return known
         split = split_key(key)
         topic = topics.find(split[2]) if split is not None else None
         if topic is not None and topic.delivery is Delivery.QUERY:
@@ -244,7 +239,7 @@ class Recorder:
         """Return the channel of something that has no key of its own."""
         track = self._by_kind.get(kind)
         if track is None:
-            track = _Track(kind, None)
+            track = _Track(kind)
             if len(self._by_kind) < 2 * CHANNELS:
                 self._by_kind[kind] = track
         return track
@@ -254,11 +249,9 @@ class Recorder:
             return
         lease = read_sender(arrival.attachment)
         holders: Mapping[bytes, str] = self._holders.get(arrival.key.partition("/@cmd/")[0], {})
-        sent = Sent(
-            lease=lease, holder=holders.get(lease) if lease is not None else None, attachment=arrival.attachment or b""
-        )
-        track = self._tracks.get((arrival.key + SENT, False)) or self._track(arrival.key + SENT, None)
-        self._put(track, arrival.arrived_ns, publish_ns, payloads.encode(sent))
+        holder = holders.get(lease) if lease is not None else None
+        sent = Sent(lease=lease, holder=holder, attachment=arrival.attachment or b"")
+        self._put(self._track(arrival.key + SENT, None), arrival.arrived_ns, publish_ns, payloads.encode(sent))
 
     def _note_state(self, topic: Topic, arrival: Arrival) -> None:
         key = arrival.key
@@ -299,8 +292,3 @@ class Recorder:
         if self._described.get(name) != pairs and (name in self._described or len(self._described) < ROBOTS):
             self._described[name] = pairs
             self._tape.add_metadata(f"robot/{name}", pairs)
-
-    def _draw(self, topic: Topic, arrival: Arrival) -> None:
-        assert self._pictures is not None
-        for kind, publish_ns, data in self._pictures.draw(arrival.key, topic, arrival.payload, arrival.arrived_ns):
-            self._put(self._extra(kind), arrival.arrived_ns, publish_ns, data)

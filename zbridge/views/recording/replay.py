@@ -5,14 +5,13 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
 import msgspec
 
 from zbridge.app.config import plan as plan_configuration
-from zbridge.app.tasks import together
 from zbridge.bus import Bus, Handle, Sample
 from zbridge.control.latch import LatchRecord
 from zbridge.errors import ConfigError, Held, PayloadError, ZbridgeError
@@ -24,6 +23,7 @@ from zbridge.hq import Listener, ListenerPlan, RobotSubscription
 from zbridge.metrics import Metrics
 from zbridge.protocol.session_table import SessionTable
 from zbridge.robot.ownership import Claim, Ownership, Standing
+from zbridge.tasks import race, together
 from zbridge.toml import read_toml
 from zbridge.views.recording.contents import MSGPACK, is_wire
 from zbridge.views.recording.player import Player
@@ -167,7 +167,7 @@ class Replay:
             serving = [self._serve_hq(recorded) for recorded in self._plan.names if self._plan.listeners]
             stack.callback(self.player.close)
             self.player.start()
-            await _first(self._ended.wait(), *watching, *serving)
+            await race(self._ended.wait(), *watching, *serving)
 
     @contextlib.asynccontextmanager
     async def _claimed(self, name: str) -> AsyncIterator[Ownership]:
@@ -206,23 +206,20 @@ class Replay:
         self._play_now(message)
 
     def _play_now(self, message: RecordedMessage) -> None:
-        target = self._targets.get(message.channel.topic, _UNKNOWN)
-        if target is _UNKNOWN:
-            target = self._target(message)
-        if target is not None:
-            robot, path = cast("tuple[ReplayedRobot, str]", target)
-            if robot.play(path, message):
-                self.played += 1
-                return
-        self.left_out += 1
+        topic = message.channel.topic
+        if topic not in self._targets:  # as many as the file has channels
+            self._targets[topic] = self._target(message)
+        target = self._targets[topic]
+        if target is not None and target[0].play(target[1], message):
+            self.played += 1
+        else:
+            self.left_out += 1
 
     def _target(self, message: RecordedMessage) -> tuple[ReplayedRobot, str] | None:
-        topic, target = message.channel.topic, None
-        split = split_key(topic)
-        if split is not None and split[0] and message.channel.encoding == MSGPACK and split[1] in self.robots:
-            target = (self.robots[split[1]], split[2])
-        self._targets[topic] = target  # as many as the file has channels
-        return target
+        split = split_key(message.channel.topic)
+        if split is None or not split[0] or message.channel.encoding != MSGPACK or split[1] not in self.robots:
+            return None
+        return self.robots[split[1]], split[2]
 
     def _on_end(self, fault: str | None) -> None:
         self.fault = fault
@@ -248,21 +245,15 @@ class Replay:
         ]
         robot.open()
         try:
-            await together(*(self._listen(listener) for listener in listeners))
+            serving = (listener.run() for listener in listeners)
+            await together(*serving, *(self._report_ready(listener) for listener in listeners))
         finally:
             robot.close()
             shown.close()
 
-    async def _listen(self, listener: Listener) -> None:
-        async def report_ready() -> None:
-            await listener.ready.wait()
-            self._report(f"HQ programs connect at {listener.address}")
-
-        reporting = asyncio.ensure_future(report_ready())
-        try:
-            await listener.run()
-        finally:
-            reporting.cancel()
+    async def _report_ready(self, listener: Listener) -> None:
+        await listener.ready.wait()
+        self._report(f"HQ programs connect at {listener.address}")
 
 
 class AsRecorded:
@@ -314,17 +305,3 @@ class _Replayed:
 
 
 _STATUS = f"/{topics.STATUS.path}"
-_UNKNOWN: Any = object()
-
-
-async def _first(*work: Coroutine[Any, Any, Any]) -> None:
-    """Run coroutines until the first one ends; raise what it raises, and cancel the others."""
-    tasks = [asyncio.ensure_future(each) for each in work]
-    try:
-        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        for task in done:
-            task.result()
-    finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)

@@ -12,6 +12,7 @@ import asyncio
 import time
 from collections import deque
 from collections.abc import Callable
+from typing import Any
 
 import msgspec
 
@@ -21,11 +22,11 @@ from zbridge.control.requests import RefusalCounts
 from zbridge.errors import NotReady, PayloadError, Unsupported
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Control, FleetMessage, Query, Refusal, Status
+from zbridge.fleet.messages import Control, FleetMessage, Query, Status
+from zbridge.fleet.payload import with_stamp
 from zbridge.fleet.topics import Delivery, KeySpace, Topic
 from zbridge.protocol.rate_limit import RateLimit
 from zbridge.views.recording.reader import RecordedMessage
-from zbridge.views.stamps import with_stamp
 
 PROTOCOL = "replay"
 """What ``status`` shows in place of the robot's protocol."""
@@ -85,8 +86,7 @@ class ReplayedRobot:
             bus.subscribe(key("@cmd/**"), self._on_command, lane=self._admit),
             *(bus.answer(key(f"@rpc/control/{name}"), self._on_lease) for name in _LEASE),
             bus.answer(key("@rpc/control/refused/*"), lambda query: query.answer(payloads.encode(Query()))),
-            bus.answer(key(topics.RPC_MAP.path), self._on_question),
-            bus.answer(key(topics.RPC_POSE.path), self._on_question),
+            *(bus.answer(key(topic.path), self._on_question) for topic in (topics.RPC_MAP, topics.RPC_POSE)),
         ]
         self._publish_status()
         self._publish_control()
@@ -164,13 +164,10 @@ class ReplayedRobot:
     def _publish_status(self) -> None:
         self._publish(topics.STATUS, msgspec.structs.replace(self._status, stamp_ns=self._clock_ns()))
 
-    def _publish_control(self) -> None:
+    def _publish_control(self, **shown: Any) -> None:
         refusals = (*self._control.refusals, *self._refusals.shown())
-        self._publish_control_of(self._control, refusals)
-
-    def _publish_control_of(self, control: Control, refusals: tuple[Refusal, ...]) -> None:
         own = {"stamp_ns": self._clock_ns(), "lease": None, "refusals": refusals, "stops": tuple(self._stops)}
-        self._publish(topics.CONTROL, msgspec.structs.replace(control, **own))
+        self._publish(topics.CONTROL, msgspec.structs.replace(self._control, **(own | shown)))
 
     def _publish(self, topic: Topic, message: FleetMessage) -> None:
         self._published_at[topic.path] = time.monotonic()
@@ -180,10 +177,9 @@ class ReplayedRobot:
         while True:
             await asyncio.sleep(REPEAT_S / 4)
             now = time.monotonic()
-            if now - self._published_at[topics.STATUS.path] > REPEAT_S * 1.2:
-                self._publish_status()
-            if now - self._published_at[topics.CONTROL.path] > REPEAT_S * 1.2:
-                self._publish_control()
+            for topic, publish in ((topics.STATUS, self._publish_status), (topics.CONTROL, self._publish_control)):
+                if now - self._published_at[topic.path] > REPEAT_S * 1.2:
+                    publish()
 
     # On the event loop
 
@@ -201,10 +197,9 @@ class ReplayedRobot:
         self._refuse(query.asked.rpartition("@rpc/control/")[2].partition("/")[0])
 
     def _on_question(self, query: IncomingQuery) -> None:
-        path = query.key.rpartition("@rpc/")[2]
-        payload = self._last.get(path)
+        payload = self._last.get(query.key.rpartition("@rpc/")[2])
         if payload is None:
-            query.refuse(NotReady("a recording, which has attachment none yet"))
+            query.refuse(NotReady("a recording, which has shown none yet"))
         else:
             query.answer(payload)
 
@@ -212,7 +207,7 @@ class ReplayedRobot:
         """Count a refusal, and show it soon. A refused stop is shown as such at once: a recording is stopped."""
         self._refusals.add(command, _REFUSED, None, None, 1)
         if command == "stop":
-            self._publish_control_of(msgspec.structs.replace(self._control, state="stopped"), self._refusals.shown())
+            self._publish_control(state="stopped", refusals=self._refusals.shown())
         if self._control_due is None:
             self._control_due = asyncio.get_running_loop().call_later(_CONTROL_S, self._show_refusals)
 

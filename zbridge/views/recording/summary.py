@@ -40,7 +40,6 @@ class KeySummary(msgspec.Struct):
         return (self.count - 1) * 1e9 / span_ns if self.count > 1 and span_ns > 0 else 0.0
 
     def note(self, message: RecordedMessage) -> None:
-        """Count a message."""
         if self.count:
             self._judge((message.log_ns - self.last_ns) / 1e9)
         else:
@@ -71,12 +70,10 @@ class Summary(msgspec.Struct):
 
     @property
     def duration_s(self) -> float:
-        """Seconds from the first message to the last."""
         return (self.end_ns - self.begin_ns) / 1e9
 
     @property
     def robots(self) -> list[str]:
-        """The robots whose keys it has."""
         return robots_of(key.topic for key in self.keys)
 
 

@@ -22,7 +22,7 @@ import msgspec
 from zbridge.errors import ConfigError
 from zbridge.views.recording.contents import ChannelKind
 from zbridge.views.recording.intake import Losses
-from zbridge.views.recording.reader import EXTRA
+from zbridge.views.recording.reader import DATAGRAM, EXTRA
 
 CHUNK_BYTES = 2**20
 """Bytes of a chunk, uncompressed, about."""
@@ -49,14 +49,9 @@ class TapeSettings(msgspec.Struct, frozen=True):
     split_s: float | None = None
     keep: int | None = None
 
-    @property
-    def splits(self) -> bool:
-        """Whether the files are numbered from the first one on."""
-        return self.split_bytes is not None or self.split_s is not None
-
     def file(self, number: int) -> Path:
-        """Return the path of the file of this number, from 1."""
-        if number == 1 and not self.splits:
+        """Return the path of the file of this number, from 1; the first has a number only where others may follow."""
+        if number == 1 and self.split_bytes is None and self.split_s is None:
             return self.path
         return self.path.with_name(f"{self.path.stem}-{number:04d}{self.path.suffix}")
 
@@ -138,7 +133,6 @@ class Tape:
 
     @property
     def bytes_written(self) -> int:
-        """Bytes of all files so far."""
         return self.bytes_before + (self._file.written if self._file is not None else 0)
 
     def begin(self, now: float, metadata: Mapping[str, Mapping[str, str]]) -> None:
@@ -148,7 +142,8 @@ class Tape:
         self._writer = None
         self._file = file = OutputFile(self._settings.file(self.number))
         self.files.append(file.path)
-        self._forget_old()
+        while self._settings.keep is not None and len(self.files) > self._settings.keep:
+            self.files.pop(0).unlink(missing_ok=True)
         self._schemas, self._channels, self._entries, self._whole = {}, 0, 0, 0
         self._blocks.clear()
         self._counts = {}
@@ -156,11 +151,10 @@ class Tape:
         self._writer = make_writer(file, self._settings.compression)
         self._writer.start(library="zbridge")
         for name, pairs in metadata.items():
-            self._writer.add_metadata(name, dict(pairs))
+            self.add_metadata(name, pairs)
         self._flush_file(now)
 
     def add_metadata(self, name: str, pairs: Mapping[str, str]) -> None:
-        """Write a metadata record."""
         self._writer.add_metadata(name, dict(pairs))
 
     def register(self, kind: ChannelKind) -> int | None:
@@ -168,17 +162,17 @@ class Tape:
         if self._channels >= CHANNELS:
             return None
         self._channels += 1
-        schema = 0
-        if kind.schema is not None:
-            schema = self._schemas.get(kind.schema.name, 0)
-            if not schema:
-                schema = self._writer.register_schema(kind.schema.name, kind.schema.encoding, kind.schema.data)
-                self._schemas[kind.schema.name] = schema
-        number: int = self._writer.register_channel(kind.topic, kind.encoding, schema, dict(kind.metadata))
-        return number
+        schema, number = kind.schema, 0
+        if schema is not None and not (number := self._schemas.get(schema.name, 0)):
+            number = self._schemas[schema.name] = self._writer.register_schema(
+                schema.name, schema.encoding, schema.data
+            )
+        channel: int = self._writer.register_channel(
+            kind.topic, kind.encoding, number, DATAGRAM if kind.datagram else {}
+        )
+        return channel
 
     def write(self, topic: str, channel: int, log_ns: int, publish_ns: int, sequence: int, data: bytes) -> None:
-        """Write one message."""
         self.messages += 1
         self._counts[topic] = self._counts.get(topic, 0) + 1
         self._writer.add_message(channel, log_ns, data, publish_ns, sequence)
@@ -255,11 +249,6 @@ class Tape:
         if file is not None:
             self.bytes_before += file.written
             file.close()
-
-    def _forget_old(self) -> None:
-        keep = self._settings.keep
-        while keep is not None and len(self.files) > keep:
-            self.files.pop(0).unlink(missing_ok=True)
 
 
 def make_writer(stream: Any, compression: Compression) -> Any:

@@ -30,7 +30,7 @@ LINGER_S = 0.5
 _READ = 65_536
 
 
-class WireLink:
+class WireLink(asyncio.DatagramProtocol):
     """One link of the robot. report: called with what happens, for people."""
 
     def __init__(
@@ -50,7 +50,10 @@ class WireLink:
         self._speed = speed
         self._report = report
         self._connections: asyncio.Queue[tuple[asyncio.StreamReader, asyncio.StreamWriter]] = asyncio.Queue()
-        self._talking = False
+        self._writer: asyncio.StreamWriter | None = None
+        """Of the conversation that is played."""
+        self._began = 0.0
+        self._answered = True
         self._received = 0
         self._news = asyncio.Event()
         self._datagrams: asyncio.DatagramTransport | None = None
@@ -76,21 +79,19 @@ class WireLink:
                 if self._datagrams is not None:
                     self._datagrams.close()
 
-    def receive_datagram(self, data: bytes, source: tuple[str, int]) -> None:
-        """Take a datagram of the gateway's host."""
-        if source[0] == self._peer:
-            self._source = source
+    def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
+        if addr[0] == self._peer:
+            self._source = addr
             self._note(len(data))
 
     async def _open_datagrams(self, address: Address) -> None:
-        loop = asyncio.get_running_loop()
+        local = (address.host, address.port)
         with contextlib.suppress(OSError):  # a robot without datagrams needs none
-            self._datagrams, _ = await loop.create_datagram_endpoint(
-                lambda: _Datagrams(self), local_addr=(address.host, address.port)
-            )
+            loop = asyncio.get_running_loop()
+            self._datagrams, _ = await loop.create_datagram_endpoint(lambda: self, local_addr=local)
 
     async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if self._talking or not self._connections.empty():
+        if self._writer is not None or not self._connections.empty():
             writer.close()
             return
         self._connections.put_nowait((reader, writer))
@@ -98,31 +99,32 @@ class WireLink:
     async def _play_all(self) -> None:
         with open_recording(self._path) as file:
             reader = RecordingReader(file)
-            number, conversation = 0, None
+            number = 0
             async with contextlib.AsyncExitStack() as stack:
                 for step in steps(reader.messages(), self._keys, self.link):
                     if step.number != number:
                         await stack.aclose()
-                        number, conversation = step.number, await stack.enter_async_context(self._conversation())
-                    assert conversation is not None
-                    await conversation.play(step)
+                        number = step.number
+                        writer = await stack.enter_async_context(self._conversation())
+                    await self._play(step, writer)
                     self.frames += 1
                 await asyncio.sleep(LINGER_S)
             if reader.fault is not None:
                 self._report(f"{self.link}: the recording is not whole: {reader.fault}")
 
     @contextlib.asynccontextmanager
-    async def _conversation(self) -> AsyncIterator[_Playback]:
+    async def _conversation(self) -> AsyncIterator[asyncio.StreamWriter]:
         """Wait for the gateway's connection, and hold it."""
         reader, writer = await self._connections.get()
-        self._talking, self._received, self._source = True, 0, None
+        self._writer, self._received, self._source = writer, 0, None
+        self._began, self._answered = asyncio.get_running_loop().time(), True
         self._peer = writer.get_extra_info("peername")[0]
         self._report(f"{self.link}: the gateway connected from {self._peer}")
         listening = asyncio.ensure_future(self._listen(reader))
         try:
-            yield _Playback(self, writer, asyncio.get_running_loop().time(), self._speed)
+            yield writer
         finally:
-            self._talking = False
+            self._writer = None
             listening.cancel()
             writer.close()
             with contextlib.suppress(OSError):
@@ -137,7 +139,7 @@ class WireLink:
         self._received += size
         self._news.set()
 
-    async def wait_received(self, size: int) -> bool:
+    async def _wait_received(self, size: int) -> bool:
         """Wait until the gateway has sent so many bytes; False where it did not in time."""
         try:
             async with asyncio.timeout(ANSWER_S):
@@ -149,44 +151,18 @@ class WireLink:
             return False
         return True
 
-    def send_datagram(self, data: bytes, writer: asyncio.StreamWriter) -> None:
-        """Send a datagram to the gateway."""
-        if self._datagrams is not None:
-            self._datagrams.sendto(data, self._source or writer.get_extra_info("peername")[:2])
-
-
-class _Playback:
-    """One connection of the gateway."""
-
-    def __init__(self, link: WireLink, writer: asyncio.StreamWriter, began: float, speed: float) -> None:
-        self._link = link
-        self._writer = writer
-        self._began = began
-        self._speed = speed
-        self._answered = True
-
-    async def play(self, step: WireStep) -> None:
+    async def _play(self, step: WireStep, writer: asyncio.StreamWriter) -> None:
         """Send a frame when it is due."""
         loop = asyncio.get_running_loop()
         await asyncio.sleep(max(0.0, self._began + step.at_s / self._speed - loop.time()))
         if step.answers and self._answered:
             due = loop.time()
-            self._answered = await self._link.wait_received(step.received)
+            self._answered = await self._wait_received(step.received)
             self._began += loop.time() - due
         if step.datagram:
-            self._link.send_datagram(step.frame, self._writer)
-        elif not self._writer.is_closing():
-            self._writer.write(step.frame)
+            if self._datagrams is not None:
+                self._datagrams.sendto(step.frame, self._source or writer.get_extra_info("peername")[:2])
+        elif not writer.is_closing():
+            writer.write(step.frame)
             with contextlib.suppress(OSError):
-                await self._writer.drain()
-
-
-class _Datagrams(asyncio.DatagramProtocol):
-    def __init__(self, link: WireLink) -> None:
-        self._link = link
-
-    def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
-        self._link.receive_datagram(data, addr)
-
-    def error_received(self, exc: Exception) -> None:
-        """Bear a port that nobody has bound."""
+                await writer.drain()

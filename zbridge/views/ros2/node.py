@@ -7,14 +7,13 @@ import threading
 import time
 from collections.abc import Iterable
 from functools import partial
-from typing import Any
 
 from zbridge.bus import Bus, Handle, Sample
 from zbridge.client import Fleet
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Devices, FleetMessage
 from zbridge.fleet.topics import KeySpace, Topic, is_concrete
-from zbridge.ros2 import Kind
+from zbridge.ros2 import LATCHED, Kind
 from zbridge.views.live_robots import OnDemandSubscriptions, read_payload
 from zbridge.views.ros2.outlets import Outlet, RosSide
 from zbridge.views.ros2.pictures import TOPICS, RosPictures, RosTopic
@@ -62,7 +61,8 @@ class RobotNode:
         self._services = Services(side, self.node, robot, drive=drive, on_stop=self._on_stop)
         self._declare(TOPICS)
         for name, message in self._pictures.fixed(time.time_ns()):
-            self._publish(message, self._outlets[name])
+            for outlet in self._outlets[name]:
+                outlet.put(message)
         self._handles.append(bus.subscribe(keys.key(topics.DEVICES.path), self._on_devices, history=True))
 
     def __repr__(self) -> str:
@@ -91,18 +91,13 @@ class RobotNode:
 
     def _outlet(self, topic: RosTopic, name: str) -> Outlet:
         endpoint = self._side.endpoint(self.node, Kind.PUBLISHER, name, topic.type_name, topic.qos)
-        made: list[Outlet] = []
-
-        def listened(anybody: bool) -> None:
-            self._on_listened(topic.name, made[0], anybody)
-
-        made.append(Outlet(self._side, endpoint, listened, kept=topic.qos.depth if topic.latched else 0))
-        return made[0]
+        kept = topic.qos.depth if topic.qos == LATCHED else 0
+        return Outlet(self._side, endpoint, partial(self._on_listened, topic.name), kept=kept)
 
     # On demand
 
     def _on_listened(self, name: str, outlet: Outlet, anybody: bool) -> None:
-        if self._closed or outlet not in self._outlets.get(name, ()):  # it was message of before it was closed
+        if self._closed or outlet not in self._outlets.get(name, ()):  # it was told of before it was closed
             return
         with self._lock:
             listened = self._listened.setdefault(name, set())
@@ -115,8 +110,7 @@ class RobotNode:
 
     def _subscribe(self) -> None:
         """Subscribe on the fleet's bus to what the topics that are listened to need, and to nothing else."""
-        needed = {path for name in self._listened for path in self._paths[name]}
-        self._subscribed.need(needed)
+        self._subscribed.need({path for name in self._listened for path in self._paths[name]})
 
     def _subscribe_to(self, path: str) -> Handle:
         topic = topics.find(path) if is_concrete(path) else None
@@ -143,28 +137,20 @@ class RobotNode:
         for made, outlet in due:
             outlet.put(made)
 
-    def _publish(self, message: Any, outlets: Iterable[Outlet]) -> None:
-        for outlet in outlets:
-            outlet.put(message)
-
     def _on_devices(self, sample: Sample) -> None:
         devices = read_payload(Devices, sample.payload, self._malformed)
         if devices is None or self._closed:
             return
         with self._lock:
             sensors = self._pictures.sensors(devices.devices)
-        self._drop_sensors({topic.name for topic in sensors})
-        self._declare(sensors)
-
-    def _drop_sensors(self, present: set[str]) -> None:
-        """Take back the topics of sensors that the robot has no more."""
-        for name in self._outlets.keys() - present - _FIXED:
+        for name in self._outlets.keys() - {topic.name for topic in sensors} - _FIXED:  # the robot has them no more
             for outlet in self._outlets.pop(name):
                 outlet.close()
             with self._lock:
                 self._listened.pop(name, None)
             del self._paths[name]
         self._subscribe()
+        self._declare(sensors)
 
     def _diagnose(self) -> None:
         """Tell once a second, while somebody listens."""
@@ -176,7 +162,8 @@ class RobotNode:
             more = [self.teleop.diagnostics()] if self.teleop is not None else []
             with self._lock:
                 message = self._pictures.diagnostics(more, time.time_ns())
-            self._publish(message, outlets)
+            for outlet in outlets:
+                outlet.put(message)
             self._timer = asyncio.get_running_loop().call_later(DIAGNOSED_S, self._diagnose)
 
     def _on_stop(self) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from zbridge.bus import Bus, Handle
@@ -25,11 +26,7 @@ class RosSide:
         self.sent = metrics.count("ros2_sent")
         self.not_encoded = metrics.count("ros2_not_encoded")
 
-    def __repr__(self) -> str:
-        return f"<RosSide domain {self.domain}, {self.types.distro}>"
-
     def node(self, namespace: str, name: str) -> Node:
-        """Name a node of this session."""
         return Node(self.domain, self.bus.zid, next(self._numbers), namespace, name)
 
     def endpoint(self, node: Node, kind: Kind, name: str, type_name: str, qos: RosQoS) -> Endpoint:
@@ -38,18 +35,18 @@ class RosSide:
 
 
 class Outlet:
-    """One publisher. listened: called when the first subscriber comes and the last one goes."""
+    """One publisher. listened: called with it when the first subscriber comes (True) and the last one goes (False)."""
 
-    def __init__(self, side: RosSide, endpoint: Endpoint, listened: Callable[[bool], None], *, kept: int) -> None:
+    def __init__(
+        self, side: RosSide, endpoint: Endpoint, listened: Callable[[Outlet, bool], None], *, kept: int
+    ) -> None:
         self._side = side
         self._gid = endpoint.gid()
-        self._numbers: Iterator[int] = itertools.count(1)
+        self._numbers = itertools.count(1)
         best_effort = endpoint.qos.reliability is Reliability.BEST_EFFORT
-        self._publisher = side.bus.frames(endpoint.key, listened, best_effort=best_effort, kept=kept)
+        on_listened = partial(listened, self)
+        self._publisher = side.bus.frames(endpoint.key, on_listened, best_effort=best_effort, kept=kept)
         self._handles: tuple[Handle, ...] = (side.bus.announce(endpoint.token()), self._publisher)
-
-    def __repr__(self) -> str:
-        return f"<Outlet {self._publisher.key}>"
 
     def put(self, message: Any) -> None:
         """Publish a message, or one that is CDR already; what ROS's types cannot hold is counted and left out."""

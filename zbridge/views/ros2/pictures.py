@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Container, Iterator
 from typing import Any
 
@@ -23,13 +22,13 @@ from zbridge.fleet.messages import (
     Scanner,
     Status,
 )
+from zbridge.fleet.payload import measured_ns
 from zbridge.metrics import Metrics
+from zbridge.protocol.odometry import Odometry
 from zbridge.ros2 import KEEP_LAST_10, LATCHED, SENSOR_DATA, RosQoS, Types, ros_name
-from zbridge.views.ros2.description import Frames, urdf
 from zbridge.views.ros2.diagnostics import Diagnostic, entries_of
 from zbridge.views.ros2.settings import RobotBody
-from zbridge.views.ros2.shapes import Shapes, Speeds, speeds_of
-from zbridge.views.stamps import measured_ns
+from zbridge.views.ros2.shapes import Frames, Shapes, Speeds, header, speeds_of, urdf
 
 LONGEST_S = 3.0
 """Nothing is added up over a longer pause: nobody knows what happened."""
@@ -43,6 +42,7 @@ class Reckoning:
     def __init__(self) -> None:
         self.pose = Pose(0.0, 0.0, 0.0)
         self.spread = 1.0
+        self._odometry = Odometry(1.0)
         self._at_ns: int | None = None
 
     def __repr__(self) -> str:
@@ -56,12 +56,7 @@ class Reckoning:
         passed_s = (stamp_ns - before) / 1e9 if before is not None else 0.0
         if 0.0 < passed_s <= LONGEST_S:
             way, turned = speeds.forward_mps * passed_s, speeds.turn_radps * passed_s
-            middle = self.pose.heading + turned / 2
-            self.pose = Pose(
-                self.pose.x + way * math.cos(middle),
-                self.pose.y + way * math.sin(middle),
-                math.remainder(self.pose.heading + turned, math.tau),
-            )
+            self.pose = self._odometry.moved(way, turned, stamp_ns)
             self.spread = min(self.spread + SPREAD_PER_M * (abs(way) + abs(turned)), 1e6)
         return self.pose
 
@@ -89,11 +84,6 @@ class RosTopic(msgspec.Struct, frozen=True):
     qos: RosQoS = KEEP_LAST_10
     paths: tuple[str, ...] = ()
     everywhere: bool = False
-
-    @property
-    def latched(self) -> bool:
-        """Whether who comes late gets the last message."""
-        return self.qos == LATCHED
 
 
 TOPICS = (
@@ -143,9 +133,6 @@ class RosPictures:
         self._positions: dict[str, float] = {}
         self._names: dict[str, str] = {}
 
-    def __repr__(self) -> str:
-        return f"<RosPictures {self.robot}>"
-
     def sensors(self, devices: tuple[Device, ...]) -> list[RosTopic]:
         """Return the topics of a robot's sensors; names that are one in ROS have one topic."""
         found: dict[str, RosTopic] = {}
@@ -170,7 +157,10 @@ class RosPictures:
         if self._body.map_to_odom:
             pairs[self.frames.map, self.frames.odom] = (Pose(0.0, 0.0, 0.0), 0.0)
         yield "tf_static", self._shapes.transforms(pairs, now_ns)
-        yield "robot_description", self._shapes.text(urdf(self.robot, self.frames, self._body))
+        yield (
+            "robot_description",
+            self._types.message("std_msgs/msg/String", data=urdf(self.robot, self.frames, self._body)),
+        )
 
     def make(self, path: str, message: FleetMessage, now_ns: int, wanted: Container[str]) -> Made:
         """Make the messages of the topics ``wanted`` of a fleet message that came on a path."""
@@ -187,23 +177,18 @@ class RosPictures:
 
     def diagnostics(self, more: list[Diagnostic], now_ns: int) -> Any:
         """Make a DiagnosticArray of what is known, and of ``more``."""
-        make = self._types.message
-        entries = [*entries_of(self.robot, self._status, self._control), *more]
-        return make(
-            "diagnostic_msgs/msg/DiagnosticArray",
-            header=self._shapes.header(now_ns, ""),
-            status=[
-                make(
-                    "diagnostic_msgs/msg/DiagnosticStatus",
-                    level=entry.level,
-                    name=entry.name,
-                    message=entry.message,
-                    hardware_id=self.robot,
-                    values=[make("diagnostic_msgs/msg/KeyValue", key=key, value=value) for key, value in entry.values],
-                )
-                for entry in entries
-            ],
-        )
+        status = [
+            {
+                "level": entry.level,
+                "name": entry.name,
+                "message": entry.message,
+                "hardware_id": self.robot,
+                "values": [{"key": key, "value": value} for key, value in entry.values],
+            }
+            for entry in (*entries_of(self.robot, self._status, self._control), *more)
+        ]
+        fields = {"header": header(now_ns, ""), "status": status}
+        return self._types.nested("diagnostic_msgs/msg/DiagnosticArray", fields)
 
     def _on_scan(self, path: str, scan: Scan, stamp_ns: int, wanted: Container[str]) -> Made:
         before, self._scan_at_ns = self._scan_at_ns, stamp_ns

@@ -13,6 +13,7 @@ from zbridge.errors import BusError, ConfigError
 from zbridge.fleet.topics import KeySpace
 from zbridge.metrics import Metrics
 from zbridge.ros2 import ros_name, types_of
+from zbridge.tasks import Tasks
 from zbridge.views.live_robots import ROBOTS, watch_robots
 from zbridge.views.ros2.node import RobotNode
 from zbridge.views.ros2.outlets import RosSide
@@ -31,9 +32,9 @@ async def serve(plan: Ros2Plan, bus: BusSettings, metrics: Metrics, on_ready: Ca
         fleet = await open_bus(bus, metrics, wait_for_peers=True, realm=plan.realm, threads=False)
         stack.push_async_callback(fleet.close)
         try:
-            ros = await open_bus(plan.ros, metrics, timestamps=True, threads=False)
+            ros = await open_bus(plan.router, metrics, timestamps=True, threads=False)
         except BusError as error:
-            where = ", ".join(plan.ros.connect)
+            where = ", ".join(plan.router.connect)
             raise BusError(f"{error}: no ROS router at {where}: `ros2 run rmw_zenoh_cpp rmw_zenohd`") from error
         stack.push_async_callback(ros.close)
         require_two_routers(fleet, ros, plan)
@@ -47,7 +48,7 @@ async def serve(plan: Ros2Plan, bus: BusSettings, metrics: Metrics, on_ready: Ca
 def require_two_routers(fleet: Bus, ros: Bus, plan: Ros2Plan) -> None:
     """Raise ConfigError where both sessions are at one router: a fleet's rules do not know ROS's keys."""
     if set(fleet.routers()) & set(ros.routers()) or fleet.zid in ros.routers():
-        where = ", ".join(plan.ros.connect)
+        where = ", ".join(plan.router.connect)
         raise ConfigError(
             f"ros = {where}: the same router as the fleet's. Both like port 7447: give one of them another port, "
             "and say where with --ros or --connect"
@@ -64,14 +65,13 @@ class View:
         self._side = side
         self.nodes: dict[str, RobotNode] = {}
         self._leaving: dict[str, asyncio.TimerHandle] = {}
-        self._closing: set[asyncio.Task[None]] = set()
+        self._closing = Tasks()
         self._left_out = side.metrics.count("ros2_robots_left_out")
 
     def __repr__(self) -> str:
         return f"<View of {sorted(self.nodes)}>"
 
     def start(self) -> None:
-        """Begin to look for robots."""
         watch_robots(self._fleet, self._plan.realm, self._plan.robots, self._on_gateway)
         self._side.bus.watch_connected(self._on_connected)
 
@@ -80,7 +80,7 @@ class View:
         for timer in self._leaving.values():
             timer.cancel()
         nodes, self.nodes = list(self.nodes.values()), {}
-        await asyncio.gather(*(node.close() for node in nodes), *self._closing, return_exceptions=True)
+        await asyncio.gather(*(node.close() for node in nodes), *self._closing.running, return_exceptions=True)
 
     def _on_connected(self, up: bool) -> None:
         if not up:
@@ -113,9 +113,7 @@ class View:
         self._leaving.pop(robot, None)
         node = self.nodes.pop(robot, None)
         if node is not None:
-            task = asyncio.get_running_loop().create_task(self._close(node))
-            self._closing.add(task)
-            task.add_done_callback(self._closing.discard)
+            self._closing.start(self._close(node))
 
     async def _close(self, node: RobotNode) -> None:
         with contextlib.suppress(BusError):

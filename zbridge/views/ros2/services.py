@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import time
 from collections.abc import Awaitable, Callable
 from functools import partial
@@ -12,6 +11,7 @@ from zbridge.bus import Handle, IncomingQuery
 from zbridge.client import Robot
 from zbridge.errors import BusError, Malformed, NotReady, ProtocolError, Refused, describe
 from zbridge.ros2 import SERVICES, Attachment, Kind, Node, read_attachment
+from zbridge.tasks import Tasks
 from zbridge.views.ros2.outlets import RosSide
 
 TRIGGER, SET_BOOL = "std_srvs/srv/Trigger", "std_srvs/srv/SetBool"
@@ -19,7 +19,7 @@ AT_ONCE = 16
 """Calls of one robot that are carried out at the same time."""
 MOST_BYTES = 64
 """Bound of a request."""
-Work = Callable[[Any], Awaitable[None]]
+Work = Callable[[Any], Awaitable[object]]
 _WITHOUT_FIELDS = (b"\x00\x01\x00\x00", b"\x00\x00\x00\x00")
 """CDR of no fields at all, in both byte orders."""
 
@@ -31,14 +31,14 @@ class Services:
         self._side = side
         self._robot = robot
         self._on_stop = on_stop
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks = Tasks()
         self._handles: list[Handle] = []
         self._called = side.metrics.count("ros2_calls")
         self._refused = side.metrics.count("ros2_calls_refused")
-        self._serve(node, "stop", TRIGGER, self._stop)
-        self._serve(node, "latch", TRIGGER, self._latch)
+        for name, stop in (("stop", robot.stop), ("latch", robot.latch)):
+            self._serve(node, name, TRIGGER, partial(self._stop, stop))
         if drive:
-            self._serve(node, "unlatch", TRIGGER, self._unlatch)
+            self._serve(node, "unlatch", TRIGGER, lambda _: robot.unlatch())
             switches = {"set_light": robot.set_light, "set_lidar": robot.set_lidar, "set_camera": robot.set_camera}
             for name, switch in switches.items():
                 self._serve(node, name, SET_BOOL, partial(_switched, switch))
@@ -51,8 +51,7 @@ class Services:
         handles, self._handles = self._handles, []
         for handle in handles:
             handle.close()
-        for task in self._tasks:
-            task.cancel()
+        self._tasks.cancel()
 
     def _serve(self, node: Node, name: str, type_name: str, work: Work) -> None:
         endpoint = self._side.endpoint(node, Kind.SERVER, f"{node.namespace}/{name}", type_name, SERVICES)
@@ -75,9 +74,7 @@ class Services:
             self._refused.value += 1
             query.refuse(NotReady(f"more than {AT_ONCE} calls at the same time"))
             return
-        task = asyncio.get_running_loop().create_task(self._carry_out(type_name, work, request, attachment, query))
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        self._tasks.start(self._carry_out(type_name, work, request, attachment, query))
 
     def _read(self, type_name: str, payload: bytes) -> Any:
         """Read a request; ``None`` of one without fields, for which ROS writes a byte and dora-rs nothing."""
@@ -100,16 +97,9 @@ class Services:
         back = Attachment(attachment.number, time.time_ns(), attachment.gid)
         query.answer(types.encode(response), back.encode())
 
-    async def _stop(self, request: Any) -> None:
+    async def _stop(self, stop: Callable[[], Awaitable[object]], request: Any) -> None:
         self._on_stop()
-        await self._robot.stop()
-
-    async def _latch(self, request: Any) -> None:
-        self._on_stop()
-        await self._robot.latch()
-
-    async def _unlatch(self, request: Any) -> None:
-        await self._robot.unlatch()
+        await stop()
 
 
 async def _switched(switch: Callable[[bool], Awaitable[None]], request: Any) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Annotated
 
 import msgspec
@@ -51,7 +50,10 @@ class RobotBody(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Ros2Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The file, TOML; options win over it. others: of robots that have no table of their own below ``robot``."""
+    """The file, TOML; options win over it. robots: those that are shown, empty for all.
+
+    others: of robots that have no table of their own below ``robot``.
+    """
 
     domain: int = 0
     distro: str = "jazzy"
@@ -63,22 +65,14 @@ class Ros2Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     others: RobotBody = RobotBody()
     robot: dict[str, RobotBody] = {}
 
-
-class Ros2Plan(msgspec.Struct, frozen=True):
-    """What the view starts from. robots: those that are shown, empty for all."""
-
-    domain: int
-    distro: str
-    ros: BusSettings
-    realm: str
-    robots: frozenset[str]
-    drive: bool
-    others: RobotBody
-    bodies: Mapping[str, RobotBody]
-
     def body(self, robot: str) -> RobotBody:
-        """Return what is known of a robot."""
-        return self.bodies.get(robot, self.others)
+        return self.robot.get(robot, self.others)
+
+
+class Ros2Plan(Ros2Settings, frozen=True):
+    """Settings that are sound. router: how ROS's router is reached."""
+
+    router: BusSettings = BusSettings()
 
 
 def plan(settings: Ros2Settings) -> Ros2Plan:
@@ -87,22 +81,12 @@ def plan(settings: Ros2Settings) -> Ros2Plan:
         raise ConfigError(f"domain = {settings.domain}: expected 0 to 232")
     if settings.distro not in DISTROS:
         raise ConfigError(f"distro = {settings.distro!r}: expected one of {', '.join(DISTROS)}")
-    robots = frozenset(settings.robots)
-    for name in sorted(robots | settings.robot.keys()):
+    for name in sorted({*settings.robots, *settings.robot}):
         if not is_name(name):
             raise ConfigError(f"robot {name!r}: expected letters, digits, '_', '.' and '-' only")
     connect = settings.ros or (ROS_ROUTER,)
     try:
-        ros = msgspec.convert({"mode": "client", "connect": connect, "multicast": False}, BusSettings)
+        router = msgspec.convert({"mode": "client", "connect": connect, "multicast": False}, BusSettings)
     except msgspec.ValidationError as error:
         raise ConfigError(f"ros = {list(connect)}: expected Zenoh endpoints like {ROS_ROUTER!r}") from error
-    return Ros2Plan(
-        domain=settings.domain,
-        distro=settings.distro,
-        ros=ros,
-        realm=settings.realm,
-        robots=robots,
-        drive=settings.drive,
-        others=settings.others,
-        bodies=settings.robot,
-    )
+    return Ros2Plan(**msgspec.structs.asdict(settings), router=router)

@@ -14,32 +14,36 @@ T = TypeVar("T")
 log = logging.getLogger("zbridge.app")
 
 
-class Background:
+class Tasks:
     """Tasks that run beside what their owner does. What one raises is logged."""
 
     def __init__(self) -> None:
-        self._running: set[asyncio.Task[None]] = set()
+        self.running: set[asyncio.Task[None]] = set()
 
     def __len__(self) -> int:
-        return len(self._running)
+        return len(self.running)
 
     def __repr__(self) -> str:
-        return f"<Background of {len(self)} tasks>"
+        return f"<Tasks {len(self)}>"
 
-    def run(self, work: Coroutine[Any, Any, None]) -> None:
-        """Run a coroutine from now on."""
+    def start(self, work: Coroutine[Any, Any, None]) -> None:
+        """Run a coroutine from now on, until it ends, or until :meth:`cancel`."""
         task = asyncio.ensure_future(work)
-        self._running.add(task)
+        self.running.add(task)
         task.add_done_callback(self._done)
 
-    async def cancel(self) -> None:
-        """End all tasks."""
-        for task in self._running:
+    def cancel(self) -> None:
+        """Cancel the tasks that still run."""
+        for task in self.running:
             task.cancel()
-        await asyncio.gather(*self._running, return_exceptions=True)
+
+    async def end(self) -> None:
+        """Cancel the tasks that still run, and wait for their ends."""
+        self.cancel()
+        await asyncio.gather(*self.running, return_exceptions=True)
 
     def _done(self, task: asyncio.Task[None]) -> None:
-        self._running.discard(task)
+        self.running.discard(task)
         if not task.cancelled() and (error := task.exception()) is not None:
             log.error("%s", error, exc_info=error)
 
@@ -65,17 +69,22 @@ async def together(*work: Coroutine[Any, Any, None], first: Callable[[], Awaitab
             await asyncio.shield(asyncio.gather(*tasks, return_exceptions=True))
 
 
-async def until(event: asyncio.Event, work: Coroutine[Any, Any, None]) -> None:
-    """Run a coroutine until it ends, or an event is set: then cancel it and wait until it has ended."""
-    tasks = (asyncio.ensure_future(work), asyncio.ensure_future(event.wait()))
+async def race(*work: Coroutine[Any, Any, object]) -> None:
+    """Run coroutines until one of them ends: then cancel the others, wait for their ends, and raise what it raised."""
+    tasks = [asyncio.ensure_future(each) for each in work]
     try:
-        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        if tasks[0].done():
-            tasks[0].result()
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            task.result()
     finally:
         for task in tasks:
             task.cancel()
         await asyncio.shield(asyncio.gather(*tasks, return_exceptions=True))
+
+
+async def until(event: asyncio.Event, work: Coroutine[Any, Any, None]) -> None:
+    """Run a coroutine until it ends, or an event is set: then cancel it and wait until it has ended."""
+    await race(work, event.wait())
 
 
 async def until_signal(
@@ -95,10 +104,10 @@ async def until_signal(
             task.cancel()
         asked.append(number)
 
-    beside = Background()
+    beside = Tasks()
 
     def start(begin: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        beside.run(begin())
+        beside.start(begin())
 
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, end, number)

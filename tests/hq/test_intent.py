@@ -37,6 +37,7 @@ HAPPENED: dict[str, Callable[[Intent, str], object]] = {
     "released": lambda intent, _: intent.released(),
     "expire": lambda intent, now: intent.expire(float(now)),
     "heard": lambda intent, now: intent.heard(float(now)),
+    "restored": lambda intent, heard_at: intent.restore("manual", "restarted", float(heard_at)),
 }
 SHOWN: dict[str, Callable[[Intent, str], object]] = {
     "held": lambda intent, _: intent.held,
@@ -130,6 +131,11 @@ a neutral still ends motion at once, and one without a silence before it counts 
 a neutral that was said before a stop does not count after it [driving]
     heard 0.1; 0.1 motion -> send; heard 2.0; 2.0 neutral -> send; lost stop; expire 2.4; is needs neutral
     2.4 motion ! stop
+a neutral and motion that waited in the kernel during a long restart move nothing
+    restored 0; heard 2; 2 neutral -> nothing; 2 motion ! restarted; heard 2.1; 2.1 neutral -> nothing; is needs neutral
+    heard 2.5; 2.5 motion -> acquire
+after a short restart a neutral counts at once
+    restored 1; heard 2; 2 neutral -> nothing; 2 motion -> acquire
 a new program was not silent
     heard 0; 0 neutral -> nothing; 0.1 motion -> acquire
 # Control modes

@@ -113,9 +113,12 @@ class Intent(Stick):
             self.idle_s = lease_s - min(EARLY_S, lease_s / 4)
         super().granted()
 
-    def restore(self, mode: str, why: str) -> None:
-        """Go on, needing neutral, with the mode that the program chose in another process."""
-        self.mode, self.needs_neutral = mode, why
+    def restore(self, mode: str, why: str, heard_at: float) -> None:
+        """Go on, needing neutral, with the mode that the program chose in another process.
+
+        heard_at: when that one heard of the program last: since then, what the program sent waited in the kernel.
+        """
+        self.mode, self.needs_neutral, self.heard_at = mode, why, heard_at
 
     # Time
 

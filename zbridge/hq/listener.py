@@ -123,6 +123,7 @@ class Listener:
             finally:
                 if self.handover.detached.is_set():
                     self._refusals.close()
+                    await asyncio.shield(self._context.tasks.end())
                 else:
                     await asyncio.shield(self._leave())
 

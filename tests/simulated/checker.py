@@ -14,6 +14,7 @@ from tests.simulated.accounts import SLACK_S, TOLERANCE, Command, Grant, fault_o
 from tests.simulated.fleet import FleetRules
 from tests.simulated.obligations import LEFT, Obligations
 from tests.simulated.released import Released
+from tests.simulated.served import ServedRules
 from tests.simulated.shown import Shown
 from tests.simulated.stops import StopRules
 from tests.simulated.written import Written
@@ -51,6 +52,8 @@ class Checker:
         self.latches: dict[str, dict[bytes, float]] = {each.name: {} for each in simulation.gateways}
         self.uncertain: set[bytes] = set()
         """Latched stops of which a gateway may know and another one not: it was killed, or has not taken over."""
+        self._unlatched: defaultdict[bytes, set[str]] = defaultdict(set)
+        """By latched stop, the gateways at which it was released."""
         self._before_go: defaultdict[str, set[bytes]] = defaultdict(set)
         """By gateway, the latched stops that a successor received."""
         self.gateways = {each.name: each for each in simulation.gateways}
@@ -88,7 +91,7 @@ class Checker:
         }
         self.obligations = Obligations(self)
         self.written, self.released, self.stops = Written(self), Released(self), StopRules(self)
-        self.rules = (self.written, self.released, self.stops, FleetRules(self), Shown(self))
+        self.rules = (self.written, self.released, self.stops, FleetRules(self), Shown(self), ServedRules(self))
         self.know_mode: set[str] = set()
         """The gateways that know that the robot was told to move by itself."""
         self._mode_at = 0.0
@@ -124,6 +127,7 @@ class Checker:
         self.counts[f"{verb} {'ok' if answer.get('ok', True) else answer.get('code')}"] += 1
         if verb.startswith("unlatch"):
             stop_id = request.get("id", b"")
+            self._unlatched[stop_id].add(gateway)
             for name, known in self.latches.items():
                 if known.pop(stop_id, None) is not None and name != gateway:
                     self.uncertain.add(stop_id)  # that gateway has still to learn of it
@@ -155,7 +159,7 @@ class Checker:
         grant.deadman_s = min(request.get("deadman_s") or most_s, most_s)
         grant.base_s = now - request.get("asked at", now)
         self.end(grant.gateway, "granted again" if again else "superseded")
-        self._neutral_between(self._taken_at.pop(grant.who, None), grant)
+        self.released.granted(grant, self._taken_at.pop(grant.who, None), self._gives)
         self.grants[grant.lease] = self.current[grant.gateway] = grant
         if any(now - at > SLACK_S for at in self.latches[grant.gateway].values()):
             self.violate("latched", f"{grant} granted while latched")
@@ -163,15 +167,6 @@ class Checker:
             if other != grant.gateway and last.ended_at is None and self._met_for(other, grant.gateway) > MEET_S:
                 self.violate("one-gateway", f"{grant} granted while {last} stands")
         self.obligations.granted(grant)
-
-    def _neutral_between(self, taken_at: float | None, grant: Grant) -> None:
-        """An HQ program whose robot was taken says neutral before it drives again."""
-        programs = self.simulation.programs
-        if taken_at is None or len(programs) != 1 or not grant.who.startswith("hq."):
-            return
-        said = self._gives[programs[0].name]
-        if not any(value == 0.0 and at > taken_at - 0.2 for at, value in said):
-            self.violate("hq-neutral", f"{grant}: nothing neutral was said since the robot was taken")
 
     def end(self, gateway: str, why: str) -> None:
         """Note the end of a gateway's lease."""
@@ -310,9 +305,11 @@ class Checker:
             return
         if key.endswith("@cmd/stop"):
             self.end(gateway, "stop")
-            if fields.get("latch") is True and fields.get("id"):
+            released_at = self._unlatched.get(fields.get("id", b""), set())
+            if fields.get("latch") is True and fields.get("id") and gateway not in released_at:
                 self.latches[gateway].setdefault(fields["id"], now)
                 self.obligations.latched(gateway)
+                self.uncertain |= {fields["id"]} if released_at else set()
             return
         command = self._commands.get((key, payload, attachment or b""))
         if command is None or gateway in command.received:

@@ -2,7 +2,19 @@
 
 from __future__ import annotations
 
-from tests.simulated.mutants_data import AUTHORITY, COMMANDS, ENFORCER, LATCH, PRESENCE, STANDSTILL, Mutant
+from tests.simulated.mutants_data import (
+    AUTHORITY,
+    COMMANDS,
+    DEVICE,
+    ENFORCER,
+    HOLDERS,
+    INTENT,
+    LATCH,
+    OWNERSHIP,
+    PRESENCE,
+    STANDSTILL,
+    Mutant,
+)
 
 
 def _mutant(name: str, file: str, old: str, new: str) -> Mutant:
@@ -94,5 +106,86 @@ FOUND = (
         STANDSTILL,
         "(self._idle_stop_s or self._authority.latches)",
         "self._idle_stop_s",
+    ),
+    _mutant(
+        "a mode 3 that waits for the disk outlives its lease",
+        COMMANDS,
+        " or waiting.verifier is not self._enforcer.authority.verifier:",
+        ":",
+    ),
+    _mutant(
+        "a gateway that yielded counts for less than one that reaches no robot",
+        OWNERSHIP,
+        "not self.leaving, self.healthy, not self.yielded)",
+        "not self.leaving, not self.yielded, self.healthy)",
+    ),
+    _mutant(
+        "what HQ programs said before a silence counts until their lease ends",
+        INTENT,
+        "< self._heard_at < now - self.deadman_s:",
+        "< self._heard_at < now - self.lease_s:",
+    ),
+    _mutant(
+        "a connection that ended while it was stalled blocks the next one",
+        PRESENCE,
+        '        self._commands.blocked = False\n        self._context.conditions.set("link", None)\n',
+        "",
+    ),
+    _mutant(
+        "a latched stop that comes during a restart is lost",
+        "zbridge/app/gateway.py",
+        "                        device.restore_latches(store.load())  # one that came last is only in the file\n",
+        "",
+    ),
+    _mutant(
+        "a gateway that yielded goes on repeating its stop",
+        "zbridge/protocol/outbox.py",
+        "            for place in (self._queue, self._urgent, self._slots):\n",
+        "            for place in (self._queue, self._urgent):\n",
+    ),
+    _mutant(
+        "the stop of a gateway that serves its robot again comes before it may write",
+        DEVICE,
+        """        self._aside = False
+        for connection in self._links:
+            connection.mute(False)
+        self._publishers.mute(False)
+        self._listen()
+        self._commands.refuse_all(None)
+        self._leases.refuse_all(None)
+        self._latch_news.returned()
+        self._standstill.begin()
+        self._enforcer.stop("served again")
+""",
+        """        self._aside = False
+        self._enforcer.stop("served again")
+        for connection in self._links:
+            connection.mute(False)
+        self._publishers.mute(False)
+        self._listen()
+        self._commands.refuse_all(None)
+        self._leases.refuse_all(None)
+        self._latch_news.returned()
+        self._standstill.begin()
+""",
+    ),
+    _mutant(
+        "the baseline of ages rises faster with every command",
+        HOLDERS,
+        "            self._baseline_ms = min(apart_ms, risen_ms)\n        self._sampled_ms = received_ms\n",
+        "            self._baseline_ms = min(apart_ms, risen_ms)\n"
+        "        self._sampled_ms = self._sampled_ms or received_ms\n",
+    ),
+    _mutant(
+        "a listener whose machine was suspended does not notice it",
+        "zbridge/hq/freeze.py",
+        "        frozen_s = now + self._suspended_s() - self._beat_at\n",
+        "        frozen_s = now - self._beat_at\n",
+    ),
+    _mutant(
+        "a latched stop that was released comes into force again",
+        LATCH,
+        "        if latch.id in self._released or latch.id in self._released_fleet:\n",
+        "        if latch.id in self._released_fleet:\n",
     ),
 )

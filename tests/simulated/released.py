@@ -5,6 +5,7 @@ Source: "HQ programs that know of no lease" in ``docs/control.md``. Programs are
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from tests.simulated.accounts import Grant
@@ -74,6 +75,13 @@ class Released:
             self._frozen |= {
                 each.name: self._world.now for each in self._simulation.programs if each.address[0] == host
             }
+
+    def granted(self, grant: Grant, taken_at: float | None, gives: Mapping[str, Iterable[tuple[float, float]]]) -> None:
+        """An HQ program whose robot was taken says neutral before it drives again."""
+        if taken_at is None or self._only is None or not grant.who.startswith("hq."):
+            return
+        if not any(value == 0.0 and at > taken_at - 0.2 for at, value in gives[self._only]):
+            self._checker.violate("hq-neutral", f"{grant}: nothing neutral was said since the robot was taken")
 
     def put(self, program: str, gives: list[tuple[float, float]]) -> None:
         """Judge motion that a listener put for a program. gives: what that said, and when."""

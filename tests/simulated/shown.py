@@ -14,6 +14,9 @@ SETTLED_S = 1.5
 """Longest time that a handshake takes once the connection is there and the robot takes commands."""
 RIVAL_S = 5.0
 """Longest time until a gateway has found that another one is gone: it asks every 0.5 s, for 1 s, and looks thrice."""
+STALLED = "the robot's link takes nothing"
+RECOVERED_S = 3.0
+"""Longest time until a link that works again is shown to do so: TCP sends again within a second."""
 RIVALS = ("another gateway serves", "a second connection is open")
 UDP_S = 2.5
 """How much longer a handshake with datagrams takes."""
@@ -53,6 +56,7 @@ class Shown:
         works = checker.obligations.works()
         if works != self._works_since[0]:
             self._works_since = (works, now)
+        self._look_for_stalled(works)
         for gateway, state in self._state.items():
             if self._connected(gateway) or state != "established":
                 self._apart_since.pop(gateway, None)
@@ -65,6 +69,13 @@ class Shown:
         if works is not None and settled and self._state.get(works) != "established" and self._judges(works, SETTLED_S):
             checker.violate("status", f"{works} shows {self._state.get(works)}, and its robot is established")
             self._works_since = (works, now)
+
+    def _look_for_stalled(self, works: str | None) -> None:
+        """``status`` says that a link is stalled for as long as it is."""
+        if works is None or self._world.now - self._works_since[1] < RECOVERED_S:
+            return
+        if STALLED in self._reason.get(works, "") and self._judges(works, RECOVERED_S):
+            self._checker.violate("status", f"{works} reaches its robot, and shows: {self._reason.pop(works)}")
 
     def _look_for_rivals(self) -> None:
         """``status`` names another gateway of the robot for as long as that one is there."""

@@ -78,9 +78,10 @@ def _wiggled_over_a_cut(rng: random.Random, made: Made) -> None:
 
 
 def _frozen_listener(rng: random.Random, made: Made) -> None:
-    """A listener is frozen while its program pushes, for less than the program's deadman."""
+    """A listener is frozen, or its machine suspended, while its program pushes, for less than its deadman."""
     gateway = _stick(rng, made, alone=True)
-    freeze = _fault(rng.uniform(5.0, 6.0), "pause", target=gateway["name"], **{"for": rng.uniform(0.95, 1.25)})
+    kind = rng.choice(("pause", "suspend"))
+    freeze = _fault(rng.uniform(5.0, 6.0), kind, target=gateway["name"], **{"for": rng.uniform(0.95, 1.25)})
     made["steps"] = [_drive(3.5, "stick1") | {"for": 6.0}, freeze]
 
 

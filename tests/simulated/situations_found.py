@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable
 
-from tests.simulated.steps import WHEELS, Made, drive, fault, split
+from tests.simulated.steps import WHEELS, Made, drive, fault, split, stick, tcpudp
 
 
 def _client(made: Made) -> None:
@@ -93,6 +93,102 @@ def _stop_into_a_cut(rng: random.Random, made: Made) -> None:
     made["steps"] = [{"t": 4.0, "who": "op1", "do": "stop"}, cut, {"t": 6.0, "who": "op2", "do": what}]
 
 
+def _stopped_before_mode_3(rng: random.Random, made: Made) -> None:
+    """Somebody chooses mode 3 on a gateway whose disk is slow, and loses the lease before the mode is written."""
+    tcpudp(rng, made)
+    _client(made)
+    made["drivers"][1] |= {"router": "router1"}
+    ends = rng.choice(("stop", "latch", "takeover", "kill"))
+    meanwhile = {"t": 4.5, "when": "mode unwritten", "after": rng.uniform(0.0, 0.15)}
+    if ends == "kill":
+        meanwhile |= fault(4.5, "kill", target="op1") | {"for": 4.0}
+    elif ends == "takeover":
+        meanwhile |= {"who": "op2", "do": "drive", "for": 0.5, "silent": True, "takeover": True}
+    else:
+        meanwhile |= {"who": "op2", "do": ends}
+    slow = fault(4.0, "threads", target="gw1", by=0.6) | {"for": 6.0}
+    choice = drive(5.0, "op1", mode="autonomous", silent=True, then=None, holds=2.0)
+    made["steps"] = [slow, choice, meanwhile, {"t": 9.0, "who": "op2", "do": "stop"}]
+
+
+def _owner_without_robot(rng: random.Random, made: Made) -> None:
+    """Two gateways serve the robot, and meet; then the way between the robot and one of them is cut for long."""
+    tcpudp(rng, made)
+    steps = split(rng, made, t=3.5, s=rng.uniform(9.0, 11.0))
+    t = 3.5 + steps[0]["for"] + rng.uniform(5.0, 6.0)
+    cut = fault(t, "cut", between=["robot", rng.choice(("gw1", "gw1", "gw2"))]) | {"for": rng.uniform(10.0, 14.0)}
+    made["steps"] = [*steps, cut, *(drive(t + rng.uniform(8.0, 9.0), who) for who in ("op1", "op2"))]
+
+
+def _wiggled_over_a_short_cut(rng: random.Random, made: Made) -> None:
+    """An HQ program of a short deadman wiggles its stick while its network is cut, for less than its lease lasts."""
+    gateway, t = stick(rng, made, alone=rng.random() < 0.5), 5.0
+    protocol = "alf" if made["robot"]["protocol"] == "alf" else rng.choice(("alf", "wc2ec"))
+    gateway["hq"], made["programs"][0]["protocol"] = [protocol], protocol
+    cut_s = rng.uniform(1.2, 2.4)
+    cut = fault(t, "cut", between=["desk1", gateway["host"]], both=True) | {"for": cut_s}
+    made["steps"] = [drive(3.5, "stick1") | {"for": 1.8}, cut]
+    while t < 5.0 + cut_s - 0.3:
+        t += rng.uniform(0.35, 0.6)
+        made["steps"].append(drive(t, "stick1") | {"for": rng.uniform(0.1, 0.2)})
+
+
+def _both_drive_and_meet(rng: random.Random, made: Made) -> None:
+    """Two gateways serve the robot, and each drives it when they meet; the one that stays drives on."""
+    tcpudp(rng, made)
+    steps = split(rng, made, t=3.5, s=rng.uniform(9.0, 11.0))
+    t = 3.5 + steps[0]["for"] - 1.0
+    made["steps"] = [*steps, *(drive(t, who) | {"for": 6.0} for who in ("op1", "op2"))]
+
+
+def _lost_while_stalled(rng: random.Random, made: Made) -> None:
+    """The link to the robot stalls, and its connection is reset before it recovers; somebody drives again."""
+    t = rng.uniform(4.0, 5.0)
+    cut_s = rng.uniform(1.2, 3.0)
+    cut = fault(t, "cut", between=["robot", "gw1"]) | {"for": cut_s}
+    reset = fault(t + rng.uniform(0.6, cut_s), "reset", between=["robot", "gw1"])
+    made["steps"] = [drive(3.0, "op1"), cut, reset, drive(t + cut_s + 4.0, "op2", takeover=True)]
+    if made["robot"]["protocol"] == "tcpudp":
+        made["robot"]["options"]["udp"] = False
+
+
+def _latched_while_restarting(rng: random.Random, made: Made) -> None:
+    """Somebody latches a robot whose gateway is handing everything over; somebody else asks for the robot then."""
+    for each in made["drivers"]:
+        each |= {"options": {}, "router": "router1"}
+    made["network"] = {"delay_s": 0.0005, "jitter_s": 0.0005}
+    steps: list[Made] = []
+    for number in range(5):
+        t = 4.0 + 5.0 * number
+        steps.append(fault(t, "restart", target="gw1"))
+        latch = {"t": t, "who": "op1", "do": "latch", "fleet": rng.random() < 0.3}
+        when = rng.choice(("Hello unsent", "Hello sent", "Hello got"))
+        steps.append(latch | {"when": when, "after": round(rng.uniform(0.0, 0.001), 5)})
+        steps.append(drive(t + 1.5, "op2", takeover=True) | {"for": 1.0})
+        steps += [{"t": t + 3.5 + 0.5 * fleet, "who": "op1", "do": "unlatch", "fleet": bool(fleet)} for fleet in (0, 1)]
+    made["steps"] = steps
+
+
+def _latched_late(rng: random.Random, made: Made) -> None:
+    """Somebody who latches is cut off before it is confirmed; what is repeated arrives after somebody released it."""
+    for each, router in zip(made["drivers"], ("router1", "router2"), strict=True):
+        each |= {"options": {}, "router": router}
+    t, fleet = rng.uniform(4.0, 5.0), rng.random() < 0.2
+    after = rng.uniform(0.0, 0.3) if fleet else 0.0
+    cut = fault(3.5, "cut", between=["pc2", "router2"], when="stop unwritten", after=after)
+    release = {"who": "op1", "do": "unlatch", "fleet": fleet}
+    made["steps"] = [cut | {"for": rng.uniform(1.5, 2.7)}, {"t": t, "who": "op2", "do": "latch", "fleet": fleet}]
+    made["steps"] += [release | {"t": t + 0.7}, drive(t + 6.0, "op1")]
+
+
+def _cut_after_long(rng: random.Random, made: Made) -> None:
+    """A program that has driven for long is cut off for less than its deadman; all that it sent arrives at once."""
+    _client(made)
+    t = rng.uniform(24.0, 34.0)
+    cut = fault(t, "cut", between=["pc1", "router1"]) | {"for": rng.uniform(0.9, 1.6)}
+    made["steps"] = [drive(2.0, "op1", hz=20.0, deadman_s=2.0, wiggles=rng.random() < 0.3) | {"for": t + 2.0}, cut]
+
+
 FOUND: tuple[Callable[[random.Random, Made], None], ...] = (
     _cut_when_granted,
     _cut_when_granted,
@@ -104,4 +200,12 @@ FOUND: tuple[Callable[[random.Random, Made], None], ...] = (
     _moves_an_arm,
     _late_start,
     _stop_into_a_cut,
+    _stopped_before_mode_3,
+    _owner_without_robot,
+    _wiggled_over_a_short_cut,
+    _both_drive_and_meet,
+    _lost_while_stalled,
+    _latched_while_restarting,
+    _latched_late,
+    _cut_after_long,
 )

@@ -20,6 +20,13 @@ def fault(t: float, fault: str, **more: Any) -> Made:
     return {"t": t, "fault": fault, **more}
 
 
+def tcpudp(rng: random.Random, made: Made) -> None:
+    """Let the robot be one of TCP/UDP without datagrams, where it is another one."""
+    if made["robot"]["protocol"] != "tcpudp":
+        options = {"version": rng.choice(("1.1", "1.3", "1.4")), "lossless": bool(made["control"])}
+        made["robot"] = {"protocol": "tcpudp", "options": options, "device": {}}
+
+
 def second_gateway(made: Made) -> None:
     """Let two gateways take part, each with a router and a program of its own."""
     made["gateways"] = [

@@ -21,6 +21,10 @@ DOUBTED_S = 11.0
 """Longest time until a gateway doubts a connection: a handshake with UDP, and 5 s."""
 ASIDE_S = 1.3
 """Longest time until a gateway that leaves its robot to another one has stopped it."""
+BACK_S = 0.5
+"""Longest time until a gateway that serves its robot again has stopped it."""
+STOPPED_ONCE_S = 0.5
+"""A gateway that left its robot to another one so long ago has written the one stop, and writes no more."""
 
 
 def stops(protocol: str, data: bytes) -> bool:
@@ -44,6 +48,11 @@ class Written:
         self._moves: set[str] = set()
         """Gateways whose last frame of the kind was motion."""
         self._aside: set[str] = set()
+        """Gateways that left a moving robot to another one."""
+        self._left_at: dict[str, float] = {}
+        """By gateway, when it left the robot to another one."""
+        self._back: set[str] = set()
+        """Gateways that serve the robot again, and have not stopped it."""
         self._connected_at = 0.0
         self._open: dict[str, tuple[End, float]] = {}
         """By gateway, its connection to the robot once a stop was written to it, and when it was open last."""
@@ -59,14 +68,21 @@ class Written:
                 self._hold_back(gateway)
         elif what == "withdraws" and who in self._checker.gateways and fields[0].endswith("/@alive/gateway"):
             self._on_aside(who)
-        elif what == "announces" and who in self._aside and fields[0].endswith("/@alive/gateway"):
-            self._aside.discard(who)
-            self._owes[who] = "since it serves the robot again"
+        elif what == "announces" and fields[0].endswith("/@alive/gateway"):
+            if self._left_at.pop(who, None) is not None:
+                self._on_back(who)
+            if who in self._aside:
+                self._aside.discard(who)
+                self._owes[who] = "since it serves the robot again"
+        elif what in ("killed", "ended", "started", "took over"):
+            self._left_at.pop(who, None)
 
     def written(self, gateway: str, data: bytes) -> None:
         """Take what a gateway wrote."""
         protocol = self._checker.protocol
+        self._look_aside(gateway, data)
         if stops(protocol, data):
+            self._back.discard(gateway)
             if self._owes.pop(gateway, "").endswith("connected"):
                 self._note_open(gateway)
             self._moves.discard(gateway)
@@ -105,9 +121,22 @@ class Written:
             grant.held_back = True
             self._checker.counts["a held robot was lost, and is back"] += 1
 
+    def _look_aside(self, gateway: str, data: bytes) -> None:
+        """Judge what a gateway writes that left the robot to another one: one stop, and then no more."""
+        left_at, protocol = self._left_at.get(gateway), self._checker.protocol
+        if left_at is None or self._world.now - left_at < STOPPED_ONCE_S:
+            return
+        if (stops(protocol, data) or motions(protocol, data)) and self._checker.obligations.calm_since(left_at):
+            self._left_at.pop(gateway)
+            self._checker.violate("aside", f"{gateway} left the robot to another gateway, and writes {data.hex()}")
+
     def _on_aside(self, gateway: str) -> None:
         """A gateway that leaves its robot to another one stops it, over the connection that it keeps."""
-        if self._checker.simulation.members[gateway].ending or gateway not in self._moves:
+        member = self._checker.gateways[gateway]
+        if member.ending or member.part("+") is not None:  # a process that hands over withdraws its token too
+            return
+        self._left_at[gateway] = self._world.now
+        if gateway not in self._moves:
             return
         self._aside.add(gateway)
         begun = self._world.now
@@ -120,6 +149,20 @@ class Written:
                 self._checker.violate("stop-aside", f"{gateway} left the robot to another gateway, and moving")
 
         self._world.after(ASIDE_S, look)
+
+    def _on_back(self, gateway: str) -> None:
+        """A gateway that serves its robot again begins with a stop."""
+        begun = self._world.now
+        self._back.add(gateway)
+
+        def look() -> None:
+            owes, obligations = gateway in self._back, self._checker.obligations
+            self._back.discard(gateway)
+            calm = self._ran(gateway, BACK_S + 1.0) and obligations.calm_since(begun)
+            if owes and calm and obligations.works() == gateway:
+                self._checker.violate("stop-first", f"{gateway} serves the robot again, and does not stop it")
+
+        self._world.after(BACK_S, look)
 
     def _links(self) -> list[End]:
         """The connections of gateways to the robot that are open."""

@@ -220,14 +220,14 @@ def _proofs() -> list[Figure]:
     given = Lease(ok=True, lease=bytes(range(8)), token=bytes(range(32)), expires_in_s=3.0)
     signer, verifier = Signer(given), Verifier(bytes(range(8)), bytes(range(32)))
     payload = packed(drive(1))
-    attachment = signer.command(DRIVE, payload)
+    attachment = signer.command(DRIVE, payload, 0)
 
     def check() -> None:
         assert verifier.plausible(attachment)
         assert verifier.proves(read(attachment), DRIVE, payload)
 
     def sign() -> None:
-        signer.command(DRIVE, payload)
+        signer.command(DRIVE, payload, 0)
 
     figures = []
     for what, work in (("checked", check), ("made", sign)):

@@ -253,11 +253,11 @@ def on_a_gateway(seconds: float, attacks: Sequence[str]) -> Iterator[tuple[str, 
                 return f"at rest {scene.rest_since(at):.3f} s after a stop"
 
         for attack in attacks:
-            before = len(scene.robot.told)
+            before = len(scene.robot.commands)
             line = attacked(pid, scene.router_at, attack, seconds, "/scan", SCAN, stop)
             (table,) = fleet.get("fleet/r1/@rpc/sessions/gateway")
             counted = {name: table["sessions"][0]["counters"][name] for name in ("malformed", "dropped")}
-            speeds = {told.forward for told in scene.robot.told[before:]}
+            speeds = {command.forward for command in scene.robot.commands[before:]}
             faults = [f"the robot was told {speeds}"] * (speeds != {0.0, ros_robot.FORWARD})
             faults += [f"{fleet.state()}: {fleet.reason()}"] * (fleet.state() != "established")
             yield f"{line}; {counted}", faults

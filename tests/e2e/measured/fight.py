@@ -184,7 +184,7 @@ def fight(seconds: float, seed: int = 1) -> Story:
                 "fleet/r1/control", lambda sample: story.control.append(msgpack.unpackb(sample.payload.to_bytes()))
             )
         )
-        driver = ("fight", "--be", "driver", scene.endpoint)
+        driver = ("tests.e2e.measured.fight", "--be", "driver", scene.endpoint)
         drivers = [Part(stack, *module(*driver, name, seconds, seed)) for name in NAMES]
         for driver_part in drivers:
             assert driver_part.line() == "ready"

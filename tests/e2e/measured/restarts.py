@@ -157,7 +157,7 @@ class Vehicle(Numbered):
 
     def __init__(self) -> None:
         super().__init__()
-        self._reader = alf.CommandReader("text", {alf.DRIVE, alf.END}, 100)
+        self._reader = alf.CommandReader("text", {alf.DRIVE, alf.END})
 
     def message(self, number: int) -> bytes:
         return alf.write("text", alf.SCAN, [number, 20 * number, *[1000] * alf.POINTS, 0, alf.POINTS - 1])

@@ -20,18 +20,8 @@ from zbridge.bus.interface import Sort
 from zbridge.control.latch import LatchRecord
 from zbridge.fleet.messages import Latch
 from zbridge.fleet.topics import KeySpace
-from zbridge.robot.ownership import (
-    ANNOUNCE_S,
-    CLOSE_S,
-    LOOKS,
-    MOST_S,
-    RIVALS,
-    WATCH_S,
-    YOUNG_S,
-    Claim,
-    Ownership,
-    Standing,
-)
+from zbridge.robot.claim import LOOKS, MOST_S, RIVALS, YOUNG_S, Claim, Standing
+from zbridge.robot.ownership import ANNOUNCE_S, CLOSE_S, WATCH_S, Ownership
 
 pytestmark = pytest.mark.jumping
 

@@ -22,6 +22,7 @@ LATCH = "zbridge/control/latch.py"
 INTENT = "zbridge/hq/intent.py"
 STICK = "zbridge/lease/stick.py"
 OWNERSHIP = "zbridge/robot/ownership.py"
+CLAIM = "zbridge/robot/claim.py"
 COMMANDS = "zbridge/robot/commands.py"
 DEVICE = "zbridge/robot/device.py"
 STANDSTILL = "zbridge/control/standstill.py"
@@ -262,7 +263,7 @@ MUTANTS = (
     Mutant(
         "both gateways yield",
         "ownership",
-        OWNERSHIP,
+        CLAIM,
         "        if first != second:\n            return first > second",
         "        if first != second:\n            return True",
     ),
@@ -270,8 +271,8 @@ MUTANTS = (
         "a claim is not announced",
         "ownership",
         OWNERSHIP,
-        "question.answer(_write(self._claim()))",
-        "question.answer(_write(Claim()))",
+        "question.answer(write(self._claim()))",
+        "question.answer(write(Claim()))",
     ),
     Mutant(
         "nobody looks before taking",
@@ -365,7 +366,7 @@ MUTANTS = (
     Mutant(
         "a waiting gateway does not learn of mode 3",
         "situations",
-        OWNERSHIP,
+        CLAIM,
         "        return LatchRecord(self.latches, self.released, self.released_fleet, self.autonomous)",
         "        return LatchRecord(self.latches, self.released, self.released_fleet)",
     ),

@@ -10,7 +10,6 @@ from tests.simulated.mutants_data import (
     HOLDERS,
     INTENT,
     LATCH,
-    OWNERSHIP,
     PRESENCE,
     STANDSTILL,
     Mutant,
@@ -115,15 +114,15 @@ FOUND = (
     ),
     _mutant(
         "a gateway that yielded counts for less than one that reaches no robot",
-        OWNERSHIP,
+        "zbridge/robot/claim.py",
         "not self.leaving, self.healthy, not self.yielded)",
         "not self.leaving, not self.yielded, self.healthy)",
     ),
     _mutant(
         "what HQ programs said before a silence counts until their lease ends",
         INTENT,
-        "< self._heard_at < now - self.deadman_s:",
-        "< self._heard_at < now - self.lease_s:",
+        "< self.heard_at < now - self.deadman_s:",
+        "< self.heard_at < now - self.idle_s:",
     ),
     _mutant(
         "a connection that ended while it was stalled blocks the next one",
@@ -134,7 +133,7 @@ FOUND = (
     _mutant(
         "a latched stop that comes during a restart is lost",
         "zbridge/app/gateway.py",
-        "                        device.restore_latches(store.load())  # one that came last is only in the file\n",
+        "                    device.restore_latches(store.load())  # one that came last is only in the file\n",
         "",
     ),
     _mutant(

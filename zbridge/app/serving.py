@@ -19,8 +19,9 @@ from zbridge.control.context import Conditions
 from zbridge.control.latch import LatchRecord
 from zbridge.control.latch_store import LatchStore
 from zbridge.errors import Held
+from zbridge.robot.claim import Claim, Standing
 from zbridge.robot.device import Device
-from zbridge.robot.ownership import Claim, Ownership, Standing
+from zbridge.robot.ownership import Ownership
 
 log = logging.getLogger("zbridge.app.gateway")
 

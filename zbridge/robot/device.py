@@ -35,12 +35,12 @@ from zbridge.protocol.plugin import RobotSide
 from zbridge.protocol.session import Datagram, Session, State
 from zbridge.protocol.session_kept import PARTIAL
 from zbridge.protocol.session_table import SessionTable
+from zbridge.robot.claim import Standing
 from zbridge.robot.commands import Commands
 from zbridge.robot.connection import Attach, Connect, Connection, Hooks, Links
 from zbridge.robot.fleet_latches import FleetLatchNews
 from zbridge.robot.observer import Boundary, LastStop, Nobody, Observer, StopFrame
 from zbridge.robot.on_demand import OnDemand
-from zbridge.robot.ownership import Standing
 from zbridge.robot.presence import Presence
 from zbridge.robot.publishers import RobotPublishers
 from zbridge.robot.queries import PendingQueries, Queries

@@ -1,8 +1,7 @@
 """Ownership: one gateway per robot. A second gateway finds the first one's claim, waits until it goes, and says so.
 
-A claim is an answered query (:class:`Claim`). The bus tells whose claim an answer is (the replier), never a payload.
-The liveliness token beside the claim shows sooner that there may be another gateway; without a claim behind it, it
-means nothing.
+A claim is an answered query (:class:`~zbridge.robot.claim.Claim`). The liveliness token beside the claim shows sooner
+that there may be another gateway; without a claim behind it, it means nothing.
 
 Theory of operation. The machine is :attr:`Ownership.TABLE`, ``{state: {input: (action, next state)}}``;
 ``docs/control.md`` shows the same table, and a test compares both. The gateway awaits :meth:`Ownership.take`, then
@@ -41,17 +40,25 @@ import msgspec
 from zbridge.bus import Bus, Handle, IncomingQuery
 from zbridge.control.latch import LatchRecord
 from zbridge.errors import BusError
-from zbridge.fleet.messages import Latch, StopId
 from zbridge.fleet.topics import KeySpace
 from zbridge.machine import step
 from zbridge.protocol.kept import Exported
+from zbridge.robot.claim import (
+    CLAIM,
+    LOOKS,
+    Claim,
+    ClaimQuestion,
+    OtherGateways,
+    Standing,
+    best_claims,
+    read_question,
+    write,
+)
 
 log = logging.getLogger("zbridge.app.gateway")
 
 LOOK_S = 0.25
 """Seconds between two looks for other gateways while the robot is not owned."""
-LOOKS = 3
-"""Looks in a row that must find no gateway after one was seen or the bus was gone, or no claim behind a token."""
 SETTLE_S = 0.25
 """Longest wait for the first connection of the bus."""
 ANNOUNCE_S = 0.1
@@ -62,89 +69,9 @@ WATCH_S = 5.0
 """Seconds between two looks for others while the robot is served."""
 CLOSE_S = 0.5
 """The same while there may be another gateway that serves the robot; the least time between two looks."""
-YOUNG_S = 60.0
-"""Seconds for which a gateway that found nobody at its start looks closely: it may have started beside a cut."""
 SPREAD_S = 1.0
 """All gateways of a router find their bus at once, and look each at another moment of so many seconds."""
-RIVALS = 16
-"""Claims of others that are considered at a time: the best."""
-MOST_S = 10 * 365 * 86_400.0
-"""The longest time for which a robot can have been served, seconds: ten years. Longer claims are ignored."""
 _WHO = "gateway"
-CLAIM = "@rpc/claim/gateway"
-"""The path at which a gateway answers with its claim."""
-
-
-class Standing(msgspec.Struct, frozen=True):
-    """How a gateway stands with its robot.
-
-    healthy: the robot is established, not in doubt, and was heard of a moment ago. connected_s: age of the connection,
-    0 where there is none. record: the robot's latched stops, and what else survives a restart.
-    """
-
-    healthy: bool = False
-    connected_s: float = 0.0
-    record: LatchRecord = LatchRecord()
-
-
-class Claim(msgspec.Struct, frozen=True):
-    """What a gateway claims. held_s: seconds since the robot is served, 0 while it is not.
-
-    healthy, connected_s: its :class:`Standing`; the fields after ``leaving`` are its record. yielded: to a better
-    claim. leaving: it ends in good order.
-    """
-
-    held_s: float = 0.0
-    healthy: bool = False
-    connected_s: float = 0.0
-    yielded: bool = False
-    leaving: bool = False
-    latches: tuple[Latch, ...] = ()
-    released: tuple[StopId, ...] = ()
-    released_fleet: tuple[StopId, ...] = ()
-    autonomous: bool = False
-
-    @property
-    def record(self) -> LatchRecord:
-        """What other gateways of the robot write down."""
-        return LatchRecord(self.latches, self.released, self.released_fleet, self.autonomous)
-
-    @property
-    def plausible(self) -> bool:
-        """Whether a gateway can claim this."""
-        return all(math.isfinite(age_s) and 0 <= age_s <= MOST_S for age_s in (self.held_s, self.connected_s)) and (
-            self.held_s > 0 or self == Claim()
-        )
-
-    def better_than(self, other: Claim, zid: str, other_zid: str) -> bool:
-        """Tell whether this claim, of the session ``zid``, is better than another one's."""
-        first, second = (each.rank for each in (self, other))
-        if first != second:
-            return first > second
-        if self.yielded:
-            return zid < other_zid
-        return (self.connected_s, self.held_s, other_zid) > (other.connected_s, other.held_s, zid)
-
-    @property
-    def rank(self) -> tuple[bool, ...]:
-        """What counts before any age; higher is better."""
-        return (self.held_s > 0, not self.leaving, self.healthy, not self.yielded)
-
-
-class _Question(msgspec.Struct, frozen=True):
-    """A question for claims. zid: who asks, so that a gateway knows its own question; serves: whether it owns too.
-
-    autonomous: who asks knows that the robot was told to move by itself.
-    """
-
-    zid: str = ""
-    serves: bool = False
-    autonomous: bool = False
-
-
-_read = msgspec.msgpack.Decoder(Claim).decode
-_read_question = msgspec.msgpack.Decoder(_Question).decode
-_write = msgspec.msgpack.Encoder().encode
 
 
 class Served(Protocol):
@@ -251,7 +178,7 @@ class Ownership:
         While a bus that was connected is not, no gateway can be seen, so nothing is taken.
         """
         await self._settle()
-        others, self._looks = _Others(self._keys.robot), 1
+        others, self._looks = OtherGateways(self._keys.robot), 1
         while True:
             if self._bus_gone or await self._sees(others):
                 found = OwnershipInput.SEEN
@@ -426,7 +353,7 @@ class Ownership:
         self._came.clear()
         self._asked.clear()
 
-    async def _sees(self, others: _Others) -> bool:
+    async def _sees(self, others: OtherGateways) -> bool:
         """Look for a token, and for the claim behind it."""
         token = bool(await self._bus.alive(self._keys.alive(_WHO)))
         claims = await self._claims() if token else {}
@@ -441,21 +368,8 @@ class Ownership:
 
     async def _claims(self) -> dict[str, Claim]:
         """Ask for the claims of others; return the best by session id, the best first. Implausible ones are ignored."""
-        claims: list[tuple[Claim, str]] = []
-        heard = {self._bus.zid}
-        question = _write(_Question(self._bus.zid, self._held_since is not None, self._autonomous()))
-        for answer in await self._bus.ask(self._keys.key(CLAIM), question, timeout_s=ASK_S):
-            if answer.replier is None or answer.replier in heard:
-                continue
-            heard.add(answer.replier)
-            with contextlib.suppress(msgspec.MsgspecError, UnicodeError, RecursionError):
-                claim = _read(answer.payload)
-                if answer.error is None and claim.plausible:
-                    claims.append((claim, answer.replier))
-        claims.sort(
-            key=lambda each: (*(not good for good in each[0].rank), -each[0].connected_s, -each[0].held_s, each[1])
-        )
-        return {zid: claim for claim, zid in claims[:RIVALS]}
+        question = write(ClaimQuestion(self._bus.zid, self._held_since is not None, self._autonomous()))
+        return best_claims(await self._bus.ask(self._keys.key(CLAIM), question, timeout_s=ASK_S), self._bus.zid)
 
     def _claim(self) -> Claim:
         if self._held_since is None:
@@ -471,14 +385,14 @@ class Ownership:
         )
 
     def _on_question(self, question: IncomingQuery) -> None:
-        with contextlib.suppress(msgspec.MsgspecError, UnicodeError, RecursionError):
-            asker = _read_question(question.payload)
-            if asker.serves and asker.zid != self._bus.zid:
+        asker = read_question(question.payload)
+        if asker is not None and asker.zid != self._bus.zid:
+            if asker.serves:
                 self._asked.set()
                 self._was_asked = True
-            if asker.autonomous and asker.zid != self._bus.zid:
+            if asker.autonomous:
                 self._merge(LatchRecord(autonomous=True))
-        question.answer(_write(self._claim()))
+        question.answer(write(self._claim()))
 
     TABLE: ClassVar[dict[OwnershipState, dict[OwnershipInput, tuple[Callable[[Ownership], None], OwnershipState]]]] = {
         OwnershipState.LOOKING: {
@@ -518,34 +432,3 @@ async def _within(seconds: float, *events: asyncio.Event) -> None:
     finally:
         for wait in waits:
             wait.cancel()
-
-
-class _Others:
-    """What was seen of other gateways while the robot is waited for; each finding is logged once."""
-
-    def __init__(self, robot: str) -> None:
-        self._robot = robot
-        self._without_claim = 0
-        self._said: set[str] = set()
-        self._close_until: float | None = None
-
-    def seen(self, token: bool, claim: bool, *, leaving: bool) -> bool:
-        """Return whether there is another gateway. A token without a claim, :data:`LOOKS` times in a row, is none."""
-        if claim:
-            self._without_claim = 0
-            self._close_until = -math.inf if leaving else math.inf
-            self._say("another gateway serves %s: waiting until it goes")
-            return True
-        self._without_claim = self._without_claim + 1 if token else 0
-        if self._without_claim == LOOKS:
-            self._say("there is a token of a gateway of %s and no gateway that answers: it is ignored")
-        return 0 < self._without_claim < LOOKS
-
-    def close_until(self, now: float) -> float:
-        """Return until when others must be looked for closely: one that went without a goodbye may come back."""
-        return now + YOUNG_S if self._close_until is None else self._close_until
-
-    def _say(self, text: str) -> None:
-        if text not in self._said:
-            self._said.add(text)
-            log.warning(text, self._robot)

@@ -22,7 +22,8 @@ from zbridge.fleet.topics import Delivery, KeySpace, is_name, split_key
 from zbridge.hq import Listener, ListenerPlan, RobotSubscription
 from zbridge.metrics import Metrics
 from zbridge.protocol.session_table import SessionTable
-from zbridge.robot.ownership import Claim, Ownership, Standing
+from zbridge.robot.claim import Claim, Standing
+from zbridge.robot.ownership import Ownership
 from zbridge.tasks import race, together
 from zbridge.toml import read_toml
 from zbridge.views.recording.contents import MSGPACK, is_wire

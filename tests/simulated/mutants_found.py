@@ -122,8 +122,8 @@ FOUND = (
     _mutant(
         "what HQ programs said before a silence counts until their lease ends",
         INTENT,
-        "< self._heard_at < now - self.deadman_s:",
-        "< self._heard_at < now - self.lease_s:",
+        "< self.heard_at < now - self.deadman_s:",
+        "< self.heard_at < now - self.idle_s:",
     ),
     _mutant(
         "a connection that ended while it was stalled blocks the next one",
@@ -134,7 +134,7 @@ FOUND = (
     _mutant(
         "a latched stop that comes during a restart is lost",
         "zbridge/app/gateway.py",
-        "                        device.restore_latches(store.load())  # one that came last is only in the file\n",
+        "                    device.restore_latches(store.load())  # one that came last is only in the file\n",
         "",
     ),
     _mutant(

@@ -241,6 +241,7 @@ SITUATIONS: tuple[Callable[[random.Random, Made], None], ...] = (
     _reconnected_in_mode_3,
     _wiggled_over_a_cut,
     _frozen_listener,
+    _frozen_listener,
     _frozen_shortly,
     _idle_or_gone,
     _two_owners,

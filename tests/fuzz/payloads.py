@@ -21,7 +21,7 @@ from zbridge.host import fd_channel as supervisor
 from zbridge.lease.proof import Verifier, read
 from zbridge.protocol.address import Address, parse_device_address
 from zbridge.protocol.samples import KeyedSample, SampleKind, read_sample, write_sample
-from zbridge.robot import ownership
+from zbridge.robot import claim
 from zbridge.ros2 import Attachment, read_attachment, types_of
 from zbridge.ros2.rmw_zenoh import read_token
 from zbridge.views.foxglove import requests
@@ -92,12 +92,12 @@ def read_stops(data: bytes) -> None:
 
 def read_claim(data: bytes) -> None:
     """Read what another gateway claims, and what it asks."""
-    for reader in (ownership._read, ownership._read_question):
+    for reader in (claim._read, claim._read_question):
         with contextlib.suppress(msgspec.MsgspecError, UnicodeError, RecursionError):
             found: Any = reader(data)
-            require_same("written and read again", comparable(reader(ownership._write(found))), comparable(found))
-            if isinstance(found, ownership.Claim) and found.plausible:
-                own = ownership.Claim(held_s=5.0, healthy=True, yielded=found.yielded)
+            require_same("written and read again", comparable(reader(claim.write(found))), comparable(found))
+            if isinstance(found, claim.Claim) and found.plausible:
+                own = claim.Claim(held_s=5.0, healthy=True, yielded=found.yielded)
                 assert found.better_than(own, "a", "b") != own.better_than(found, "b", "a"), "one of two is better"
 
 
@@ -200,8 +200,8 @@ def _stops() -> Iterator[bytes]:
 
 
 def _claims() -> Iterator[bytes]:
-    yield ownership._write(ownership.Claim(held_s=3.0, healthy=True, connected_s=2.0))
-    yield ownership._write(ownership._Question("cafe", True))
+    yield claim.write(claim.Claim(held_s=3.0, healthy=True, connected_s=2.0))
+    yield claim.write(claim.ClaimQuestion("cafe", True))
 
 
 def _processes() -> Iterator[bytes]:

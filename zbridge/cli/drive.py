@@ -49,8 +49,7 @@ class Session:
             self._pilot.take()
             try:
                 while await self._obey_keys():
-                    if self._pilot.stick.held:
-                        self._drive()
+                    self._drive()
                     await asyncio.sleep(EVERY_S)
             finally:
                 await self._pilot.close()
@@ -72,11 +71,14 @@ class Session:
         return True
 
     def _drive(self) -> None:
-        """Send the drive that the keys stand for."""
-        command = self._keyboard.drive(self._loop.time())
+        """Send the drive that the keys stand for; without the lease only note that no key is held."""
+        command, held = self._keyboard.drive(self._loop.time()), self._pilot.stick.held
+        if command.moving and not held:
+            return
         try:
             self._pilot.drive(command)
-            self._show(command)
+            if held:
+                self._show(command)
         except Refused as refusal:
             self._say(str(refusal))
 

@@ -1,7 +1,7 @@
 """Replaces the code of the supervisor by that of the installed version, in place.
 
 Theory of operation. The process stays the same one (``exec``): its children stay its children, its descriptors stay
-open, and systemd sees its main process go on. First the installed code rehearses, as a process of its own: it reads
+open, and systemd sees its main process continue. First the installed code rehearses, as a process of its own: it reads
 the state and ends. So a version that does not start, or takes no such state, changes nothing. Then, at a moment when
 nothing is under way, the state goes to memory, and the installed code begins where this one was. What the children
 send meanwhile waits in their sockets. Signals wait too: they are blocked until the installed code takes them.
@@ -160,7 +160,7 @@ def quiet_threads() -> ThreadPoolExecutor:
 
 
 async def replace(command: Sequence[str], snapshot: Snapshot) -> NoReturn:
-    """Replace this code by the command's, with the state; raise HandoverError if this code has to go on."""
+    """Replace this code by the command's, with the state; raise HandoverError if this code has to continue."""
     try:
         await _rehearse(command, await _calm(snapshot))
         while True:

@@ -114,9 +114,9 @@ class Intent(Stick):
         super().granted()
 
     def restore(self, mode: str, why: str, heard_at: float) -> None:
-        """Go on, needing neutral, with the mode that the program chose in another process.
+        """Continue, needing neutral, with the mode that the program chose in another process.
 
-        heard_at: when that one heard of the program last: since then, what the program sent waited in the kernel.
+        heard_at: when that process last received from the program. What came later waited in the kernel.
         """
         self.mode, self.needs_neutral, self.heard_at = mode, why, heard_at
 

@@ -135,13 +135,13 @@ class Operator:
             self.intent.lost(why)
 
     def export(self) -> Exported:
-        """Write what outlives a restart: the control mode, and when anything was heard last. The lease does not."""
+        """Write what outlives a restart: the control mode, and when anything was received last. The lease does not."""
         return {"mode": self.intent.mode, "chose": self._chose_mode, "heard_at": self.intent.heard_at}
 
     def restore(self, state: Exported, why: str) -> None:
-        """Go on for a program that another process of this machine served; it must send neutral before it drives."""
+        """Continue for a program that another process of this machine served; it must send neutral before it drives."""
         self._chose_mode = bool(state["chose"])
-        self.intent.restore(str(state["mode"]), why, float(state.get("heard_at", -math.inf)))
+        self.intent.restore(str(state["mode"]), why, float(state["heard_at"]))
 
     def close(self) -> None:
         """Release the robot: the client is gone; idempotent."""

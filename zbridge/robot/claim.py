@@ -33,7 +33,7 @@ YOUNG_S = 60.0
 class Standing(msgspec.Struct, frozen=True):
     """How a gateway stands with its robot.
 
-    healthy: the robot is established, not in doubt, and was heard of a moment ago. connected_s: age of the connection,
+    healthy: the robot is established, not in doubt, and sent something a moment ago. connected_s: the connection's age,
     0 where there is none. record: the robot's latched stops, and what else survives a restart.
     """
 
@@ -89,7 +89,7 @@ class Claim(msgspec.Struct, frozen=True):
 class ClaimQuestion(msgspec.Struct, frozen=True):
     """A question for claims. zid: who asks, so that a gateway knows its own question; serves: whether it owns too.
 
-    autonomous: who asks knows that the robot was told to move by itself.
+    autonomous: the sender knows that the robot was ordered to move by itself.
     """
 
     zid: str = ""

@@ -11,13 +11,13 @@ LOOKING: other gateways are looked for. One look that finds none is enough at th
 gateway was seen or the bus was gone. CLAIMING: the own claim is announced, and other claims are asked for once they
 must have come. Two gateways that start at the same moment both find none; of their claims the one of the lower session
 id is better. OWNING: the robot is served. After a network that was cut has healed, two may own one robot: the better
-claim goes on owning it, and the other leaves the robot alone. YIELDED: to a better claim, but with a connection to the
+claim keeps owning it, and the other leaves the robot alone. YIELDED: to a better claim, but with a connection to the
 robot that must not be closed, for many robots accept nobody once a connection has ended. The gateway looks on until no
 claim is better, and owns the robot again.
 
 Which claim is better is told by each gateway for itself, of its own claim as it was when it asked, and of the answers.
 So a gateway that asks seems a little younger than it is: two never both think themselves better. Both may think the
-other one better where their ages are nearly the same; of two that have yielded the lower id goes on.
+other one better where their ages are nearly the same; of two that have yielded the lower id resumes.
 
 A gateway asks for claims every :data:`WATCH_S`; every :data:`CLOSE_S` while there may be another one that nobody said
 goodbye to. Who is asked by another gateway that serves the robot asks too.
@@ -253,7 +253,7 @@ class Ownership:
     def restore(self, claim: Exported) -> None:
         """Own the robot as the gateway before did, once that goes; called instead of :meth:`take`.
 
-        Until :meth:`begin` the claim is a weak one, so that the gateway before may go on if this process fails.
+        Until :meth:`begin` the claim is a weak one, so that the gateway before may continue if this process fails.
         """
         self._waits = True
         self._announce()

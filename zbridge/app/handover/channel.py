@@ -19,7 +19,7 @@ from zbridge.protocol.kept import Exported
 from zbridge.transport import Parcel
 from zbridge.wire.frames import Partial
 
-VERSION = 2
+VERSION = 3
 """The form of :class:`HandoverState`. Raise it with every change of what is ``kept`` and of the maps around it."""
 M = TypeVar("M")
 

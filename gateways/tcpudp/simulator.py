@@ -164,7 +164,7 @@ class RobotSimulator(Simulator[packets.Packet]):
         self._ids.release(client.session.client_id, self._loop.time())
 
     def check(self, session: Session[packets.Packet], message: packets.Packet) -> None:
-        """Refuse what the HQ does not know; deployed robots send parts of the map without that check."""
+        """Refuse what the HQ does not know; legacy robots send parts of the map without that check."""
         assert isinstance(session, RobotRole)
         if not isinstance(message, packets.ServerSLAMMapPart):
             session.may_send(message)
@@ -193,7 +193,7 @@ class RobotSimulator(Simulator[packets.Packet]):
             self.tell(packets.ServerLidarStatus(1))
 
     def _send_part(self, number: int) -> None:
-        """Send a part of the map to every HQ that announced LidarSim, as deployed robots do."""
+        """Send a part of the map to every HQ that announced LidarSim, as legacy robots do."""
         cells = self.vehicle.grid.cells.tobytes()
         size = -(-len(cells) // PARTS)
         start = number % PARTS * size

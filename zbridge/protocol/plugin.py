@@ -223,7 +223,7 @@ class HqSide(Kept, ABC):
         return command.moving
 
     def attend(self, client: RobotUser) -> None:
-        """Look after a client that holds the robot; called every :data:`ATTEND_S`.
+        """ReadPayload after a client that holds the robot; called every :data:`ATTEND_S`.
 
         Deployed programs repeat their motion, or the deadman ends it. For those that set it once, override this.
         """

@@ -91,7 +91,7 @@ class FragileTcpUdpHq(OperatorProgram):
         self._asked: set[int] = set()
         self._repeat_s, self._udp_port, self._times = repeat_s, udp_port, times
         self._phase = _HqPhase.CONNECTED
-        self._reads = wire.Reads(wire.HQ_LOSES_BYTES - 1)
+        self._reads = wire.ReadChecker(wire.HQ_LOSES_BYTES - 1)
         self._inbox: asyncio.Queue[tuple[Channel, Read]] = asyncio.Queue(_WAITING)
         self._robot: tuple[str, int] = ("", 0)
         self._udp: socket.socket | None = None
@@ -214,7 +214,7 @@ class FragileTcpUdpHq(OperatorProgram):
         if len(read.data) < _SMALLEST_READ:
             self._violate(f"a read of {len(read.data)} bytes, taken as a disconnect: {show(read.data)}")
             raise Ended("hung up: took a short read as a disconnect")
-        received, problem = self._reads.take(read.data)
+        received, problem = self._reads.check(read.data)
         late = f" (this process read {read.late_s * 1000:.0f} ms late)"
         if self._reads.hopeless:
             self._die(problem)

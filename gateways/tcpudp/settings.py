@@ -131,7 +131,7 @@ VERSIONS = {
 
 
 ANNOUNCED = (Feature.UDP, Feature.LIDAR_SIM)
-"""What deployed HQ programs announce."""
+"""What legacy HQ programs announce."""
 
 
 def announced(listed: str, features: Collection[Feature]) -> bytes:

@@ -60,7 +60,7 @@ SimulatedAt = Annotated[
     ),
 ]
 ServedBy = Annotated[
-    str, typer.Option(help="be an HQ program instead, as fragile as deployed ones, and connect to this address")
+    str, typer.Option(help="be an HQ program instead, as fragile as legacy ones, and connect to this address")
 ]
 Drives = Annotated[
     str, typer.Option(help="with --hq: drive FORWARD or FORWARD,TURN, fractions of full scale: 0.3 or 0.3,-0.2")

@@ -6,7 +6,7 @@ NAME is one of :data:`ROBOTS`. OPTIONS: more arguments of the robot's class, ``t
 ``tells``, as a JSON object.
 
 A robot that ``tells`` prints a line ``AT SPEED`` (monotonic seconds, fraction of full scale) for each change of what it
-last obeyed, and waits for its own sends as long as its kernel does: deployed ones block in them.
+last obeyed, and waits for its own sends as long as its kernel does: legacy ones block in them.
 """
 
 import asyncio

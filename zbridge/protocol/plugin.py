@@ -51,7 +51,7 @@ class RobotSide(Kept, ABC):
     hands_over: ClassVar[bool] = False
     """Whether this class and its sessions name in ``kept`` all that they must not lose when the gateway restarts."""
     closing_harmless: ClassVar[bool] = False
-    """Whether a robot with two connections obeys the other one as before when one is closed; most legacy ones do not."""
+    """Whether a robot with two connections obeys one as before when the other is closed; most legacy ones do not."""
     link_names: tuple[str, ...]
     """One name for each configured address, in the order of the configuration; the first link drives the robot."""
 

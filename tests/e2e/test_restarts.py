@@ -101,7 +101,7 @@ def served(bench: Bench, robot: Robot, *more: str) -> Restarted:
 
 
 def refused(gateway: Restarted, robot: Robot, bench: Bench, reason: str) -> None:
-    """The restart is refused for this reason, and the gateway goes on: it takes commands, and telemetry flows."""
+    """The restart is refused for this reason, and the gateway continues: it takes commands, and telemetry flows."""
     (answer,) = gateway.ask()
     assert answer["code"] == "not_ready"
     assert re.search(reason, answer["reason"]), answer

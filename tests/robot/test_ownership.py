@@ -14,7 +14,7 @@ import msgpack
 import pytest
 
 from tests.tables import documented, executed
-from zbridge.bus import Answer, Handle, IncomingQuery, Lane
+from zbridge.bus import Answer, Handle, IncomingQuery, PriorityClass
 from zbridge.bus.fake import FakeBus
 from zbridge.bus.interface import Sort
 from zbridge.control.latch import LatchRecord
@@ -47,8 +47,14 @@ class Distant(FakeBus):
 
         return Declared()
 
-    def answer(self, key: str, handler: Callable[[IncomingQuery], None], *, lane: Lane | Sort = Lane.OTHER) -> Handle:
-        return self._later(lambda: super(Distant, self).answer(key, handler, lane=lane))
+    def answer(
+        self,
+        key: str,
+        handler: Callable[[IncomingQuery], None],
+        *,
+        priority: PriorityClass | Sort = PriorityClass.OTHER,
+    ) -> Handle:
+        return self._later(lambda: super(Distant, self).answer(key, handler, priority=priority))
 
     def announce(self, key: str) -> Handle:
         return self._later(lambda: super(Distant, self).announce(key))
@@ -233,7 +239,7 @@ EVIL = {"held_s": 3600.0, "healthy": True, "connected_s": 3600.0}
 async def test_whose_claim_it_is_the_bus_tells_and_no_payload_and_only_the_first_counts(claims: list[Any]) -> None:
     bus = FakeBus("5")
     forge(bus.join("9"), *claims)
-    robot, _ = watched(await owned(bus))  # of two that begin the lower one goes on: 5
+    robot, _ = watched(await owned(bus))  # of two that begin the lower one continues: 5
     await asyncio.sleep(WATCH_S + 1.0)
     assert set(map(tuple, robot.rivals)) == {()}
 

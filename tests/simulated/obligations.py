@@ -76,6 +76,8 @@ class Obligations:
             self._disturbed[who] = self._calm_from = self.world.now
         elif what in DISTURBS:
             self._disturbed[who] = self._calm_from = self.world.now
+        elif what == "killed":  # one of the two processes of a restart
+            self._tokens.pop(who, None)
         elif what == "took over":
             has_token = self._tokens.pop(f"{who}+", float("inf")) <= self.world.now
             self._tokens[who] = self.world.now if has_token else float("inf")

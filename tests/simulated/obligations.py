@@ -113,7 +113,8 @@ class Obligations:
         self._control[gateway] = control
         last = self.checker.current.get(gateway)
         if last is not None and last.shown and control.get("lease") != last.lease:
-            self._ended_unexplained(last)
+            if not control.get("latches"):  # one that it learnt from others ends a lease, too
+                self._ended_unexplained(last)
             self.checker.end(gateway, "as control says")
         grant = self.checker.grants.get(control.get("lease") or b"")
         if grant is None:

@@ -122,7 +122,7 @@ class NeutralFirst(Refused):
 
 
 class Stale(Refused):
-    """The command was given too long ago: the network held it up."""
+    """The command is too old on arrival: the network delayed it."""
 
     codes = (Code.STALE,)
 

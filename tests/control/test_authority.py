@@ -468,7 +468,7 @@ def test_a_robot_that_moves_for_nobody_is_stopped_before_somebody_gets_it() -> N
     authority = made("stopped")
     MOTION(authority)
     assert authority.acquire(Acquire(who="bob"), NOW).ok
-    assert told(authority) == [f"stopped (moving for nobody when bob acquired){STOPS}", "acquired bob"]
+    assert told(authority) == [f"stopped (moving without a driver when bob acquired){STOPS}", "acquired bob"]
     assert not authority.moving
     assert authority.deadline() == NOW + LEASE_S
 

@@ -135,7 +135,7 @@ def test_a_stale_neutral_ends_motion_and_leaves_the_robot_needs_neutral() -> Non
     ann = Ann()
     ann.acquire()
     ann.command(1.0)
-    ann.authority.require_neutral("the robot's link took nothing")
+    ann.authority.require_neutral("the robot's link stalled")
     assert ann.command(1.1, 0.9, moving=False)
     with pytest.raises(NeutralFirst):
         ann.authority.require_motion()

@@ -63,7 +63,7 @@ def test_a_bad_file_ends_run_and_the_error_names_file_key_and_value(module: str,
         ("echo /fleet/r1/pose", 2, "try 'fleet/r1/pose'\n"),
         ("record --keys /fleet/** -o never.mcap", 2, "try 'fleet/**'\n"),
         ("simulate tcpudp --listen tcp://127.0.0.1:0 --hq tcp://127.0.0.1:1", 2, "give either --listen"),
-        ("simulate tcpudp --drive 0.3", 2, "--drive is an HQ program's: expected with --hq"),
+        ("simulate tcpudp --drive 0.3", 2, "--drive: only with --hq"),
         (f"simulate tcpudp --hq {NOBODY} --drive fast", 2, "drive = 'fast': expected FORWARD or FORWARD,TURN"),
         ("simulate tcpudp --listen udp://127.0.0.1:1", 1, "expected tcp://host:port"),
         ("simulate tcpudp --listen tcp://127.0.0.1:0 --camera 8000", 1, "expected tcp://host:port"),
@@ -111,7 +111,7 @@ def test_ls_echo_and_stop_say_what_there_is_and_a_stop_takes_the_robot_from_its_
     until(lambda: "refused" in fleet.reason("r2"), what="why it is offline")
     both = zbridge("stop", "--all", *at)
     assert (both.returncode, both.stdout) == (1, "1 of 2 stopped; r2 offline\n")
-    assert both.stderr.startswith("r2: stop taken, but the robot is ")
+    assert both.stderr.startswith("r2: stop accepted, but the robot is ")
     elsewhere = zbridge("stop", "--all", "--realm", "lab", *at)
     assert (elsewhere.returncode, elsewhere.stderr) == (1, "no gateways on lab/\n")
 

@@ -108,7 +108,7 @@ async def join_bus(plan: GatewayPlan, metrics: Metrics) -> Bus:
             pause = pauses.after(error)
             log.warning("no bus: %s; next attempt in %.2g s", error, pause)
             await asyncio.sleep(pause)
-    raise AssertionError("it tries for ever")
+    raise AssertionError("the session retries forever")
 
 
 async def can_connect(plan: GatewayPlan) -> bool:
@@ -144,7 +144,7 @@ async def watch_session(plan: GatewayPlan, bus: Bus, can_connect: Callable[[Gate
             changed.clear()
             await changed.wait()
         if not await returns(STUCK_S) and await can_connect(plan) and not await returns(RECONNECTS_S):
-            raise SessionUseless("Zenoh's session does not connect again, and a new one does: the bus is joined anew")
+            raise SessionUseless("Zenoh's session does not reconnect, but a new one connects: joining the bus anew")
 
 
 async def watch_certificate(

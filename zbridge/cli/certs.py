@@ -53,7 +53,7 @@ def init(
 
     made = authority.init(folder, now(), force=force)
     say(f"{folder.ca}: {made.common_name}, expires {made.expires:%Y-%m-%d}, {made.fingerprint}")
-    say(f"Keep {folder.ca_key} to yourself: whoever reads it can make a certificate for any name and any role.")
+    say(f"Keep {folder.ca_key} secret: its holder can issue a certificate for any name and role.")
     if load_roles(folder.roles).names:
         say("Names in roles.toml need certificates of this authority: zbridge certs renew --all")
 
@@ -140,7 +140,7 @@ def revoke(name: Name, directory: Directory = Path("certs")) -> None:
     from zbridge.security.certs import authority
 
     gone = authority.revoke(folder, name)
-    say(f"{gone.common_name} is revoked. {name} is never issued again.")
+    say(f"{gone.common_name} is revoked, and {name} cannot be issued again.")
     if gone.until is not None:
         say(
             f"Its certificate is valid until {gone.until:%Y-%m-%d}: Zenoh has no revocation lists. A router lets it"
@@ -164,7 +164,7 @@ def bundle(
     ] = None,
     at: Annotated[
         Path | None,
-        typer.Option(help="where the folder will stand on the other machine; FOLDER by default", show_default=False),
+        typer.Option(help="path of the folder on the other machine; FOLDER by default", show_default=False),
     ] = None,
     directory: Directory = Path("certs"),
     force: Force = False,

@@ -113,7 +113,7 @@ async def secure_bus(folder: Path, log: IO[bytes], robots: list[str]) -> AsyncIt
         viewer = await stack.enter_async_context(_joined(folder / _VIEWER))
         operator = await stack.enter_async_context(_joined(folder / _OPERATOR))
         commands = (
-            f"zbridge ls --sessions --tls {folder / _VIEWER}     # a viewer: looks and stops, and drives nothing",
+            f"zbridge ls --sessions --tls {folder / _VIEWER}     # a viewer: may watch and stop, not drive",
             f"zbridge drive {robots[0]} --tls {folder / _READER}     # an operator",
         )
         fleet = Fleet(operator, REALM, _OPERATOR)

@@ -158,7 +158,7 @@ async def put_mark(settings: BusSettings, realm: str, text: str, who: str | None
 def show_info(path: Path, *, as_json: bool) -> None:
     """Print what a recording holds."""
     summary = summarize(path)
-    if not summary.messages and summary.fault == "this is no MCAP file":
+    if not summary.messages and summary.fault == "not an MCAP file":
         raise ConfigError(f"{path}: {summary.fault}")
     if not as_json:
         _print_info(summary)
@@ -173,7 +173,7 @@ def _print_info(summary: Summary) -> None:
     began = _day(summary.begin_ns)
     console.print(shown(f"{summary.path}: {summary.size} bytes, {summary.messages} messages"))
     console.print(shown(f"from {began}, {summary.duration_s:.3f} s"))
-    console.print(shown("ended properly" if summary.fault is None else f"not ended properly: {summary.fault}"))
+    console.print(shown("complete" if summary.fault is None else f"incomplete: {summary.fault}"))
     console.print(shown(f"robots: {', '.join(summary.robots) or 'none'}"))
     for name, pairs in summary.metadata:
         console.print(shown(f"{name}: " + ", ".join(f"{key} {value}" for key, value in pairs.items() if value)))
@@ -202,10 +202,10 @@ def run_export(path: Path, output: Path | None, keys: str, since: str, until: st
     except OSError as error:
         raise ZbridgeError(f"{error.filename or output}: {error.strerror or error}") from error
     errors.print(
-        shown(f"{done.messages} messages to {output}, {done.files} files, {done.skipped} without a form there")
+        shown(f"{done.messages} messages to {output}, {done.files} files, {done.skipped} that cannot be represented")
     )
     if done.fault is not None:
-        errors.print(shown(f"the recording is not whole: {done.fault}"))
+        errors.print(shown(f"the recording is incomplete: {done.fault}"))
 
 
 class ReplayOptions(msgspec.Struct, frozen=True, kw_only=True):
@@ -251,7 +251,7 @@ async def run_replay(settings: BusSettings, options: ReplayOptions) -> None:
     others = f", {replay.left_out} left out (other robots, commands, queries, raw frames, pictures)"
     errors.print(shown(f"{replay.played} messages played{others if replay.left_out else ''}"))
     if replay.fault is not None:
-        errors.print(shown(f"the recording is not whole: {replay.fault}"))
+        errors.print(shown(f"the recording is incomplete: {replay.fault}"))
 
 
 @contextlib.contextmanager
@@ -297,7 +297,7 @@ async def run_wire(path: Path, protocol: str, listen: list[str], robots: list[st
     ready = [lambda at, name=link.link: print(f"{name} listens at {at}", flush=True) for link in links]  # noqa: T201
     await until_signal(together(*(link.run(at, tell) for link, at, tell in zip(links, addresses, ready, strict=True))))
     for link in links:
-        less = f"; in {link.unanswered} conversations the gateway said less than then" if link.unanswered else ""
+        less = f"; in {link.unanswered} conversations the gateway sent less than recorded" if link.unanswered else ""
         errors.print(shown(f"{link.link}: {link.frames} frames{less}"))
 
 

@@ -48,7 +48,7 @@ def judge(status: Status | None, *, fresh: bool) -> Health:
         return Health(HealthLevel.CRITICAL, reason="no gateway serves it")
     level, reason = _LEVELS.get(status.state, HealthLevel.CRITICAL), status.reason
     if not fresh:
-        level, reason = HealthLevel.CRITICAL, f"its gateway has said nothing for {LISTEN_S:g} s"
+        level, reason = HealthLevel.CRITICAL, f"its gateway has published nothing for {LISTEN_S:g} s"
     elif level is HealthLevel.OK and reason:
         level = HealthLevel.WARNING
     return Health(level, status.state, reason, status.host)

@@ -82,10 +82,10 @@ async def stop_robot(bus: Bus, keys: KeySpace, stop: Stop) -> None:
     try:
         status = await _last(bus, keys, topics.STATUS, Status, broken=True)
     except PayloadError as error:
-        raise NotReady(f"{keys.robot}: stop taken, but the robot's status cannot be read: {error}") from error
+        raise NotReady(f"{keys.robot}: stop accepted, but the robot's status cannot be read: {error}") from error
     if isinstance(status, Status) and status.state != "established":
         why = status.reason or "no reason known"
-        raise NotReady(f"{keys.robot}: stop taken, but the robot is {status.state}: {why}")
+        raise NotReady(f"{keys.robot}: stop accepted, but the robot is {status.state}: {why}")
 
 
 async def stop_robots(bus: Bus, realm: str, robots: Iterable[str], stop: Stop) -> dict[str, Outcome]:

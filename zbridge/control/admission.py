@@ -228,6 +228,6 @@ _REFUSALS: dict[Code, Refused] = {
     Code.NO_LEASE: LeaseLost("no lease: acquire first", Code.NO_LEASE),
     Code.MALFORMED: Malformed("wrong proof, or too large"),
     Code.OUT_OF_ORDER: Malformed("repeated or out of order", Code.OUT_OF_ORDER),
-    Code.RATE: RateLimited("too many a second"),
+    Code.RATE: RateLimited("too many per second"),
 }
 """The refusals that ``control`` shows for what was only counted."""

@@ -340,7 +340,7 @@ class Authority:
         if self._holders.current is not None:
             self._end(Cause(reason=f"taken over by {who}"))
         elif self.moving:
-            self._require_neutral(Cause(reason=f"moving for nobody when {who} acquired"))
+            self._require_neutral(Cause(reason=f"moving without a driver when {who} acquired"))
         lease, token = self._holders.new_lease()
         self.verifier, self._deadman_s = Verifier(lease, token), deadman_s
         age = CommandAge(min(self._max_age_s, deadman_s) if self._max_age_s < math.inf else math.inf)

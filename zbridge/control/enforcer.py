@@ -100,7 +100,7 @@ class Enforcer:
         """Raise Refused for a command that is too old to set the robot in motion."""
         if sender.stale:
             self._stale.value += 1
-            raise Stale("given too long ago: the network held it up")
+            raise Stale("the command is too old: the network delayed it")
 
     def require_motion(self) -> None:
         """Raise Refused where the holder must send neutral before the robot moves."""

@@ -155,7 +155,7 @@ class LeaseServer:
         for each in reported:
             _require_own_name(query, each.who or "")
         if not self._reports.take(self._clock()):
-            raise RateLimited(f"more than {REPORTS_HZ:g} tellings a second")
+            raise RateLimited(f"more than {REPORTS_HZ:g} reports a second")
         for each in reported:
             count = min(max(each.count, 1), _COUNTED)
             self._authority.refuse(each.command, refused(each.code, each.reason), each.who, by=name, count=count)

@@ -287,7 +287,7 @@ class ForkClient:
             self.unsettled = stamp != old.stamp and not stamp.settled
             if stamp in (old.stamp, self._refused) or not stamp.settled:
                 return
-            log.info("the installation has changed: its code is loaded")
+            log.info("the installed code has changed: loading it")
         try:
             server = await _Server.start(self._command, stamp)
         except NotReady as error:

@@ -206,7 +206,7 @@ class Runner:
             if process.succeeded:
                 if self._promote_successor(process):
                     continue
-                how = "handed over to nobody"
+                how = "it was not handed over"
             self.process = None
             self._former.add(process)  # it may still have to be waited for
             if not (how is None or (process.asked_to_end and not process.deposit.has_links)):
@@ -239,7 +239,7 @@ class Runner:
         """Start a successor of a dead process that keeps its connections; None where that is not possible."""
         reason = ""
         if not await process.gone(GONE_S):
-            reason = "it may still be within a read"
+            reason = "it may still be reading"
         elif self._restart_delay.failures >= RESUMED_CRASHES and process.lived_s < HEALTHY_S:
             reason = f"{RESUMED_CRASHES} processes that took it over have crashed"
         for _ in range(0 if reason else OFFERS):

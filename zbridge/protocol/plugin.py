@@ -185,7 +185,7 @@ class HqSide(Kept, ABC):
 
     def answer(self, session: Any, topic: Topic, message: FleetMessage | None, now: float) -> None:
         """Answer a client's query; ``message`` None: the robot gave no answer. Raise Refused, EncodeError."""
-        raise Unsupported(f"nothing can be asked for {topic.path}")
+        raise Unsupported(f"{topic.path} cannot be queried")
 
     def tell(self, session: Any, text: str, now: float) -> None:
         """Show a text to the people at a client, if the protocol can."""

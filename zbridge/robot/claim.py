@@ -144,7 +144,7 @@ class OtherGateways:
             return True
         self._without_claim = self._without_claim + 1 if token else 0
         if self._without_claim == LOOKS:
-            self._say("there is a token of a gateway of %s and no gateway that answers: it is ignored")
+            self._say("a gateway of %s has a token but does not answer: ignoring it")
         return 0 < self._without_claim < LOOKS
 
     def close_until(self, now: float) -> float:

@@ -21,7 +21,7 @@ from zbridge.lease.proof import Verifier
 from zbridge.protocol.plugin import Outcome
 from zbridge.protocol.session import Session, State
 
-LINK_BLOCKED = "the robot's link takes nothing"
+LINK_BLOCKED = "the robot's link is stalled"
 _MOTIONS = (Drive, Motor)
 _ESTABLISHED = State.ESTABLISHED
 WRITE_S = 0.4
@@ -52,7 +52,7 @@ class Commands:
         self._awaiting: _Awaiting | None = None
         """A mode that is carried out once it is written down."""
         self.blocked = False
-        """Whether the robot's link takes nothing: drives are not written, all other commands are refused."""
+        """Whether the robot's link is stalled: drives are not written, all other commands are refused."""
         self._topics = {context.keys.key(topics.CMD_DRIVE.path): topics.CMD_DRIVE}
         self._taken = context.metrics.count("commands")
         self._unwritten = context.metrics.count("drives_unwritten")
@@ -90,7 +90,7 @@ class Commands:
         return session
 
     def require_flowing(self) -> None:
-        """Raise Refused where the robot's link takes nothing: what waits for it would come after the stop."""
+        """Raise Refused where the robot's link is stalled: what waits for it would come after the stop."""
         if self.blocked:
             raise NotReady(LINK_BLOCKED)
 
@@ -188,7 +188,7 @@ class Commands:
         try:
             outcome = self._robot.command(topic, command, now)
             if outcome is None:
-                raise TypeError("RobotSide.command gave no Outcome")
+                raise TypeError("RobotSide.command returned no Outcome")
         except (Refused, PayloadError, EncodeError):
             raise
         except Exception as error:

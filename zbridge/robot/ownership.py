@@ -419,7 +419,7 @@ class Ownership:
 
 
 _TURNS = {
-    OwnershipState.OWNING: "no other gateway serves it better: serving it again",
+    OwnershipState.OWNING: "no other gateway has a better claim: serving it again",
     OwnershipState.YIELDED: "another gateway serves it: leaving the robot alone, and staying connected",
 }
 

@@ -58,7 +58,7 @@ def new_backlog(sock: socket.socket, kernel: Kernel) -> Backlog | None:
     except OSError:
         if not _unwatched_warned:
             _unwatched_warned = True
-            log.warning("this platform does not tell what robots acknowledged: drives are written to broken links too")
+            log.warning("this platform does not report unacknowledged bytes: drives are also written to broken links")
         return None
     backlog = Backlog()
     if unsent := kernel.unacknowledged(sock):  # of the process that had the connection before

@@ -32,7 +32,7 @@ SEND_S = 5.0
 _GROUP = 200
 """Descriptors that are sent at a time; Linux takes 253."""
 _HEADER = 4
-_ENDED = "the other side has ended"
+_ENDED = "the other process has ended"
 
 
 class Hello(msgspec.Struct, tag="hello", frozen=True):
@@ -126,7 +126,7 @@ class HandoverChannel:
                 self._receive(Failed, REASON_S)  # it may have sent why it ends
             if isinstance(error, ConnectionError):
                 raise EndError(_ENDED) from error
-            raise HandoverError(f"the other side is stalled: {error}") from error
+            raise HandoverError(f"the other process is stalled: {error}") from error
 
     def _receive(self, kind: type[M], timeout_s: float | None) -> M:
         try:
@@ -136,15 +136,15 @@ class HandoverChannel:
                 raise HandoverError(f"message of {size} bytes exceeds {MESSAGE_BYTES}")
             message = decode(self._read(size))
         except TimeoutError as error:
-            raise SilentError(f"the other side sent nothing for {timeout_s:g} s") from error
+            raise SilentError(f"the other process sent nothing for {timeout_s:g} s") from error
         except OSError as error:  # reset: it ended with a message of ours unread
             raise EndError(_ENDED) from error
         except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
-            raise HandoverError(f"the other side sent an invalid message: {error}") from error
+            raise HandoverError(f"the other process sent an invalid message: {error}") from error
         if isinstance(message, Failed):
             raise HandoverError(message.reason)
         if not isinstance(message, kind):
-            raise HandoverError(f"{type(message).__name__} came instead of {kind.__name__}")
+            raise HandoverError(f"received {type(message).__name__}, expected {kind.__name__}")
         return message
 
     def _read(self, size: int) -> bytes:
@@ -164,7 +164,7 @@ class HandoverChannel:
                 data, group, _, _ = socket.recv_fds(self._socket, 1, _GROUP)
                 received += group
                 if not data or not group:
-                    raise HandoverError(f"{len(received)} descriptors came of {descriptors}")
+                    raise HandoverError(f"{len(received)} of {descriptors} descriptors were received")
         except (OSError, HandoverError) as error:
             Parcel(received).close()
             raise error if isinstance(error, HandoverError) else HandoverError(f"no descriptors: {error}") from error

@@ -150,7 +150,7 @@ class Restarts:
     async def _restart_for(self, question: IncomingQuery, bus: Bus) -> None:
         try:
             if not topics.is_concrete(question.asked):
-                raise Unsupported("a restart is asked for of one robot, in one name")
+                raise Unsupported("a restart needs one robot and one name in its key")
             await self._restart()
         except Refused as refusal:
             question.refuse(refusal)
@@ -167,7 +167,7 @@ class Restarts:
         if self._plan.config.bus.listen:
             raise Unsupported("[bus] listen: two processes cannot listen at one endpoint; stop this one and start it")
         if self._lock.locked() or self.gone.is_set() or not self._incoming.begun.is_set():
-            raise NotReady("a restart is under way")
+            raise NotReady("a restart is in progress")
         if self._ends:
             raise NotReady("the gateway ends")
         async with self._lock:

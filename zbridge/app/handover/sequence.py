@@ -131,7 +131,7 @@ class Outgoing:
     def _require_same_parts(self) -> None:
         """Raise NotReady where the robot was taken, or left, since the parts were stopped."""
         if list(self._find_parts()) != list(self._parts):
-            raise NotReady("the robot was taken, or left to another gateway, meanwhile: ask again")
+            raise NotReady("the robot was acquired or left to another gateway meanwhile: try again")
 
     async def _receive(self, channel: HandoverChannel, kind: type[M], within_s: float) -> M:
         """Wait for a message of the successor; raise HandoverError where the gateway ends meanwhile."""
@@ -175,7 +175,7 @@ class Outgoing:
 
     def _accept(self, hello: Hello) -> None:
         if hello.version != VERSION:
-            raise HandoverError(f"the successor takes states of version {hello.version}, this gateway has {VERSION}")
+            raise HandoverError(f"the successor accepts states of version {hello.version}, this gateway has {VERSION}")
         self._process = self._processes.process(hello.pid)
 
     def _forget(self) -> None:
@@ -212,10 +212,10 @@ class Incoming:
         await self._channel.send(Hello(VERSION, self._own_pid))
         state = await self._channel.receive(HandoverState, STATE_S)
         if state.version != VERSION:
-            raise HandoverError(f"a state of version {state.version}: this zbridge takes {VERSION}")
+            raise HandoverError(f"a state of version {state.version}: this zbridge accepts {VERSION}")
         for key in sorted({*self._setup, *state.setup}):
             if state.setup.get(key) != self._setup.get(key):
-                raise HandoverError(f"{key} was changed: that needs a stop and a start")
+                raise HandoverError(f"{key} was changed: stop and start the gateway instead")
         self.parcel = await self._channel.receive_parcel(state.descriptors, PARCEL_S)
         self.state = state
         self._missing = (state.device is not None) + len(state.listeners)
@@ -234,8 +234,8 @@ class Incoming:
             await self._channel.receive(Go, GO_S)
         except EndError as error:
             if self._supervised:
-                raise HandoverError("the gateway before this one has died: the supervisor stops its robot") from error
-            log.warning("the gateway before this one has died: continuing in its place")
+                raise HandoverError("the previous gateway died: the supervisor stops its robot") from error
+            log.warning("the previous gateway died: continuing in its place")
         self._channel.close()
         self.begun.set()
 

@@ -109,7 +109,7 @@ def _undeclare_later(entity: Any) -> None:
         time.sleep(_PAUSE_S)
         if _undeclare(entity):
             return
-    log.error("%s was not taken back: Already borrowed for %g s", type(entity).__name__, UNDECLARE_S)
+    log.error("%s could not be undeclared: Already borrowed for %g s", type(entity).__name__, UNDECLARE_S)
 
 
 def _undeclare(entity: Any) -> bool:

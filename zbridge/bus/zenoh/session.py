@@ -264,7 +264,7 @@ class ZenohBus:
             async with asyncio.timeout(FLUSH_S):
                 await written
         except TimeoutError:
-            raise BusError(f"the bus took nothing for {FLUSH_S:g} s") from None
+            raise BusError(f"the bus accepted nothing for {FLUSH_S:g} s") from None
 
     def frames(
         self, key: str, listened: Callable[[bool], None], *, best_effort: bool = False, kept: int = 0

@@ -94,7 +94,7 @@ class RecordingReader:
         """Yield the messages up to the end of the file, or to what cannot be read. Raises OSError."""
         try:
             if self._file.read(len(MAGIC)) != MAGIC:
-                raise BrokenError("this is no MCAP file")
+                raise BrokenError("not an MCAP file")
             yield from self._records()
         except BrokenError as error:
             self.fault = str(error)

@@ -110,7 +110,7 @@ class WireLink(asyncio.DatagramProtocol):
                     self.frames += 1
                 await asyncio.sleep(LINGER_S)
             if reader.fault is not None:
-                self._report(f"{self.link}: the recording is not whole: {reader.fault}")
+                self._report(f"{self.link}: the recording is incomplete: {reader.fault}")
 
     @contextlib.asynccontextmanager
     async def _conversation(self) -> AsyncIterator[asyncio.StreamWriter]:

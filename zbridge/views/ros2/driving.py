@@ -31,7 +31,7 @@ RULES = StickRules(
     lapsed=f"silent for {DEADMAN_S:g} s while it drove",
     advice=": send a zero, or nothing for a second, then drive",
 )
-_EARLY = "it was there before"
+_EARLY = "it existed before"
 
 
 class TwistPublisher(msgspec.Struct, frozen=True, eq=False):

@@ -116,7 +116,7 @@ class Gateway:
     async def run(self) -> None:
         """Serve the robot and its HQ programs until cancelled; then stop the robot and close the bus.
 
-        Returns where a successor was handed everything. Raises HandoverError where this one gets nothing.
+        Returns where a successor was handed everything. Raises HandoverError if this one gets nothing.
         """
         with open_audit(self._plan, self.metrics, self.conditions) as audit:
             while True:
@@ -139,7 +139,7 @@ class Gateway:
     async def run_on(self, bus: Bus, neighbourhood: Neighbourhood | None = None) -> None:
         """Do the same on a bus, and beside metrics, that somebody else opens and closes.
 
-        neighbourhood: None where the process serves this robot only.
+        neighbourhood: None if the process serves this robot only.
         """
         self._neighbourhood = neighbourhood
         with open_audit(self._plan, self.metrics, self.conditions) as audit:
@@ -201,7 +201,7 @@ class Gateway:
         ]
 
     def missing(self) -> tuple[str, ...]:
-        """Give the reasons for which this gateway is of no use now: no bus, or its robot is not established."""
+        """Return the reasons for which this gateway is of no use now: no bus, or its robot is not established."""
         reasons = [] if self._on_the_bus or self._plan.config.bus.alone_is_normal else ["no bus"]
         if self._plan.device is not None:
             state = self._serving.state if self._serving is not None else SERVED_ELSEWHERE

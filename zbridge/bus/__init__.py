@@ -67,7 +67,7 @@ async def open_bus(
     explain: bool = True,
     threads: bool = True,
 ) -> Bus:
-    """Open a Zenoh session; raise BusError where that is not possible (a client: no router within ``within_s``).
+    """Open a Zenoh session; raise BusError if that is not possible (a client: no router within ``within_s``).
 
     The error says which case it is, where that can be found within three more seconds; it is BusRefused where trying
     again soon helps nobody. wait_for_peers: return only when the peers that scouting finds at once are connected.
@@ -95,7 +95,7 @@ async def open_bus(
 async def open_router(
     values: Mapping[str, Any], metrics: Metrics, on_neighbour: Callable[[Neighbour, bool], None]
 ) -> Bus:
-    """Open a Zenoh router; raise BusError where that is not possible.
+    """Open a Zenoh router; raise BusError if that is not possible.
 
     values: Zenoh's configuration, by paths (``listen/endpoints``). on_neighbour: called on the event loop with every
     process that connects (True) or leaves (False).

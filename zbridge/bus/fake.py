@@ -22,7 +22,7 @@ H = TypeVar("H", bound=Handle)
 
 @lru_cache(maxsize=65536)
 def meet(one: str, other: str) -> bool:
-    """Tell whether there is a key that both key expressions match."""
+    """Return whether there is a key that both key expressions match."""
     return _meet(one.split("/"), other.split("/"))
 
 

@@ -167,7 +167,7 @@ class _Queue:
             self._forgotten += self.items.popleft()[2]
 
     def take(self) -> tuple[Source, Any]:
-        """Take the oldest item, on the loop's thread; raise IndexError where there is none."""
+        """Take the oldest item, on the loop's thread; raise IndexError if there is none."""
         source, raw, size = self.items.popleft()
         self._taken += size
         return source, raw

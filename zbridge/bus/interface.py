@@ -116,7 +116,7 @@ class Answer(msgspec.Struct, frozen=True):
     """One reply to a query of ours.
 
     error: None, or why there is no payload: Refused as the replier refused, BusError for any other error reply.
-    replier: the id of the session that replied, as the bus says; None where it does not say.
+    replier: the id of the session that replied, as the bus says; None if it does not say.
     """
 
     key: str
@@ -282,4 +282,4 @@ class Bus(Protocol):
         """Call ``handler`` when the first connection to the bus is made (True) and the last one is lost (False)."""
 
     async def close(self) -> bool:
-        """Leave the bus; False where that hangs: its threads then end with the process."""
+        """Leave the bus; False if that hangs: its threads then end with the process."""

@@ -102,7 +102,7 @@ class LateJoin:
         self._asking.pop(robot, None)
 
     async def _asked_once(self, realm: str, robot: str, live: set[str]) -> bool:
-        """Ask one robot, and hand on what did not come live meanwhile; False where it did not answer."""
+        """Ask one robot, and hand on what did not come live meanwhile; False if it did not answer."""
         with contextlib.suppress(BusError):
             replies = await self._bus.ask(of_robot(self._key_expr, realm, robot))
             answers = [reply for reply in replies if reply.error is None and reply.key.startswith(f"{realm}/{robot}/")]

@@ -135,7 +135,7 @@ class Writer:
                     return
 
     def _work(self) -> bool:
-        """Make all calls by key and the oldest queued call; False where there was none."""
+        """Make all calls by key and the oldest queued call; False if there was none."""
         with self._lock:
             latest = list(self._latest.values())
             self._latest.clear()

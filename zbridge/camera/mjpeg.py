@@ -35,17 +35,17 @@ _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 def is_jpeg(data: bytes) -> bool:
-    """Tell whether the bytes begin as a JPEG does."""
+    """Return whether the bytes begin as a JPEG does."""
     return data.startswith(START)
 
 
 def is_whole(data: bytes) -> bool:
-    """Tell whether the bytes end as a JPEG does."""
+    """Return whether the bytes end as a JPEG does."""
     return data[-64:].rstrip(b"\0\r\n").endswith(END)
 
 
 def jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """Return width and height in pixels as the frame header says; None where none stands among the first segments."""
+    """Return width and height in pixels as the frame header says; None if none stands among the first segments."""
     at = 2
     for _ in range(_SEGMENTS):
         if len(data) < at + 9 or data[at] != 0xFF:
@@ -204,7 +204,7 @@ class MjpegReader:
 
 
 def _boundary(head: bytes) -> bytes:
-    """Read the boundary that an HTTP head names; raise ProtocolError where it promises no such stream."""
+    """Read the boundary that an HTTP head names; raise ProtocolError if it promises no such stream."""
     status = _STATUS.match(head)
     if status is None:
         raise ProtocolError("the answer is not HTTP")

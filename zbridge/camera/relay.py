@@ -195,7 +195,7 @@ class Relay:
 
 
 def _refusal(request: bytes) -> bytes | None:
-    """Return the answer to a request that gets no stream; None where it gets one.
+    """Return the answer to a request that gets no stream; None if it gets one.
 
     A page of a browser that reads across origins says so with ``Origin``; HQ programs have none.
     """

@@ -43,7 +43,7 @@ async def fetch(source: CameraSource, stall_s: float, on_parts: OnParts) -> None
 
 
 def explain(error: OSError) -> str:
-    """Say why in the operating system's words, on every event loop: ``Connection refused``."""
+    """Return why in the operating system's words, on every event loop: ``Connection refused``."""
     known = error.errno is not None and error.errno > 0 and not isinstance(error, socket.gaierror)
     return os.strerror(error.errno) if known and error.errno is not None else error.strerror or str(error)
 

@@ -181,7 +181,7 @@ async def echo(
 
 
 def _realm_of(key: str, realm: str | None) -> str | None:
-    """Return the realm of a key expression, None where it has several; raise ConfigError if it is not ``realm``."""
+    """Return the realm of a key expression, None if it has several; raise ConfigError if it is not ``realm``."""
     first = key.partition("/")[0]
     if realm is None:
         return first if is_name(first) else None

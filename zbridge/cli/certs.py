@@ -179,7 +179,7 @@ def bundle(
 
 
 def opened(directory: Path, command: str = "zbridge certs") -> Folder:
-    """Return the folder of the authority; raise ConfigError where the package ``cryptography`` is missing."""
+    """Return the folder of the authority; raise ConfigError if the package ``cryptography`` is missing."""
     if importlib.util.find_spec("cryptography") is None:
         raise ConfigError(f"{command} needs the package cryptography: pip install 'zbridge[certs]'")
     return Folder(directory)

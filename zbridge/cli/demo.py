@@ -98,7 +98,7 @@ class LiveTable:
 async def run_demo(seconds: float, *, secure: bool = False) -> None:
     """Show the demo for ``seconds`` (0: until interrupted); raise ZbridgeError if a robot sent no data.
 
-    secure: on mutual TLS, with roles; raises ConfigError where no certificates can be made.
+    secure: on mutual TLS, with roles; raises ConfigError if no certificates can be made.
     """
     robots = {f"{name}1": name for name in protocol_names() if _is_whole(name)}
     watch = LiveTable(list(robots))
@@ -140,7 +140,7 @@ def _left_out(error: ZbridgeError) -> str:
 
 
 def _is_whole(name: str) -> bool:
-    """Tell whether a protocol can be loaded, and what its robots need is installed; print why it cannot be loaded."""
+    """Return whether a protocol can be loaded, and what its robots need is installed; print why it cannot be loaded."""
     try:
         return all(find_spec(module) is not None for module in find_protocol(name).requires)
     except ConfigError as error:

@@ -105,7 +105,7 @@ async def _robots(bus: Bus, realm: str) -> list[str]:
 
 
 async def _restart_one(bus: Bus, keys: KeySpace, who: str) -> str | None:
-    """Return why a gateway was not restarted, or the role that this program lacks; None where it was."""
+    """Return why a gateway was not restarted, or the role that this program lacks; None if it was."""
     try:
         answers = await bus.ask(keys.key(topics.RPC_RESTART(who).path), timeout_s=ANSWER_S)
     except BusError as error:

@@ -90,7 +90,7 @@ def _metadata(options: RecordOptions) -> dict[str, dict[str, str]]:
 
 
 async def run_record(settings: BusSettings, options: RecordOptions) -> bool:
-    """Record until a signal, the end of the duration, or of the disk; False where the recording failed."""
+    """Record until a signal, the end of the duration, or of the disk; False if the recording failed."""
     if options.only not in (None, "fleet", "foxglove"):
         raise ConfigError(f"only = {options.only!r}: expected 'fleet' or 'foxglove'")
     if not is_name(options.realm):

@@ -34,7 +34,7 @@ def bus_settings(endpoints: Sequence[str] = (), tls: Tls | Path | str | None = N
     """Return how a program joins the bus: by the given endpoints, else by multicast and the router on this machine.
 
     tls: the files of this program's certificate, or a folder as ``zbridge certs bundle`` makes it, which names
-    endpoints too. Raises ConfigError where they do not go together.
+    endpoints too. Raises ConfigError if they do not go together.
     """
     if isinstance(tls, Path | str):
         return folder_settings(Path(tls), endpoints)

@@ -330,7 +330,7 @@ class Robot:
     async def unlatch(self) -> tuple[Latch, ...]:
         """Release the latched stops of this robot; return those that were in force.
 
-        Raises BusError if no gateway answers, Refused as the gateway did; Unsupported where the whole fleet is latched.
+        Raises BusError if no gateway answers, Refused as the gateway did; Unsupported if the whole fleet is latched.
         """
         return await stops.unlatch_robot(self._bus, self._keys, self._own)
 

@@ -140,7 +140,7 @@ def store(state: SupervisorState) -> int:
 
 
 def restore(descriptor: int) -> SupervisorState:
-    """Read a state, and leave the descriptor open; raise HandoverError where it cannot be understood."""
+    """Read a state, and leave the descriptor open; raise HandoverError if it cannot be understood."""
     try:
         data = os.pread(descriptor, STATE_BYTES, 0)
         if (version := _head(data).version) != VERSION:

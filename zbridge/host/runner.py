@@ -218,7 +218,7 @@ class Runner:
             self._settled.set()
 
     async def _crashed(self, process: GatewayProcess, how: str) -> GatewayProcess | None:
-        """Stop the robot of a process that died; give the process that has its connections, None where none has."""
+        """Stop the robot of a process that died; give the process that has its connections, None if none has."""
         self._attended.clear()
         log.error("%s: process %d %s", self.file.robot, process.pid, how)
         await process.deposit.stop(1)  # before anything that may take time
@@ -236,7 +236,7 @@ class Runner:
         return successor
 
     async def _inherited(self, process: GatewayProcess, stopped: asyncio.Future[None]) -> GatewayProcess | None:
-        """Start a successor of a dead process that keeps its connections; None where that is not possible."""
+        """Start a successor of a dead process that keeps its connections; None if that is not possible."""
         reason = ""
         if not await process.gone(GONE_S):
             reason = "it may still be reading"
@@ -257,7 +257,7 @@ class Runner:
         return None
 
     def _promote_successor(self, process: GatewayProcess) -> bool:
-        """Let the successor be the robot's process; False where there is none."""
+        """Let the successor be the robot's process; False if there is none."""
         successor = self._succession.take()
         self._settled.set()
         if successor is None:

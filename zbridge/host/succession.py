@@ -200,7 +200,7 @@ class Succession:
 
 
 async def _give(channel: HandoverChannel, given: HandoverState, parcel: Parcel) -> None:
-    """Give a successor what a dead process left, until it waits for the word to go; raise HandoverError."""
+    """Return a successor what a dead process left, until it waits for the word to go; raise HandoverError."""
     hello = await channel.receive(Hello, START_S)
     if hello.version != given.version:
         raise HandoverError(f"it accepts states of version {hello.version}, the dead process left {given.version}")

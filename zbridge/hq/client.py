@@ -123,7 +123,7 @@ class Client:
 
     @property
     def blocker(self) -> str | None:
-        """Why the program's connection cannot be handed to another process now; None where it can."""
+        """Why the program's connection cannot be handed to another process now; None if it can."""
         return self.conversation.blocker
 
     def export(self, parcel: Parcel) -> Exported:

@@ -95,7 +95,7 @@ class Sectors:
         return tuple(self._cut(scan))
 
     def nearest_m(self, scan: Scan) -> dict[int, float]:
-        """Give the nearest range of each covered sector, metres; ``range_max`` where it has no valid one.
+        """Return the nearest range of each covered sector, metres; ``range_max`` where it has no valid one.
 
         The sectors of the last scan are kept: asking again for the same object costs nothing.
         """
@@ -111,7 +111,7 @@ class Sectors:
         return self._nearest_m
 
     def _cut(self, scan: Scan | Scanner) -> dict[int, _Indices]:
-        """Give the indices of the points of each covered sector; kept until the geometry changes."""
+        """Return the indices of the points of each covered sector; kept until the geometry changes."""
         count = len(scan.ranges) if isinstance(scan, Scan) else min(max(scan.points, 0), MOST_POINTS)
         geometry = (scan.angle_min, scan.angle_increment, count)
         if not abs(scan.angle_min) + abs(scan.angle_increment) * count < _MOST_RAD:

@@ -95,7 +95,7 @@ class Exchange(Outbox):
             self._answer_at = now + self.answer_s
 
     def deadline(self) -> float | None:
-        """Tell when ``take`` will have something; None while an answer is awaited, or nothing waits."""
+        """Return when ``take`` will have something; None while an answer is awaited, or nothing waits."""
         return None if self.awaited is not None else super().deadline()
 
     def answered(self) -> None:
@@ -144,18 +144,18 @@ class ExchangeSession(Session[M]):
 
     @abstractmethod
     def read(self, frame: bytes) -> M:
-        """Read one frame; raise ProtocolError where it is no message. ``exchange.awaited`` is the request."""
+        """Read one frame; raise ProtocolError if it is no message. ``exchange.awaited`` is the request."""
 
     @abstractmethod
     def answers(self, request: bytes, message: M) -> bool:
-        """Tell whether a message is the answer to the request on the wire."""
+        """Return whether a message is the answer to the request on the wire."""
 
     def expects(self, request: bytes) -> bool:
-        """Tell whether a request is answered at all."""
+        """Return whether a request is answered at all."""
         return True
 
     def unasked(self, message: M) -> bool:
-        """Tell whether the robot may send a message without a request."""
+        """Return whether the robot may send a message without a request."""
         return False
 
     def unanswered(self, request: bytes, now: float) -> None:
@@ -174,7 +174,7 @@ class ExchangeSession(Session[M]):
     # How a session does it
 
     def decode(self, frame: bytes) -> M:
-        """Read one frame and complete the request that it answers; raise ProtocolError where it answers none."""
+        """Read one frame and complete the request that it answers; raise ProtocolError if it answers none."""
         message = self.read(frame)
         awaited = self.exchange.awaited
         if awaited is not None and self.answers(awaited, message):
@@ -185,7 +185,7 @@ class ExchangeSession(Session[M]):
         return message
 
     def timers(self) -> float:
-        """Tell when the request on the wire fails. A protocol with timers of its own takes the earlier."""
+        """Return when the request on the wire fails. A protocol with timers of its own takes the earlier."""
         return self.exchange.answer_at
 
     def on_timer(self, now: float) -> None:

@@ -51,7 +51,7 @@ class Budget:
         return f"<Budget {self.most_bytes}, {len(self.left_out)} left out>"
 
     def admits(self, name: str, value: Any) -> bool:
-        """Tell whether a value is written; note it if not."""
+        """Return whether a value is written; note it if not."""
         flat = isinstance(value, bytes | bytearray | None)
         size = len(value or b"") if flat else len(msgspec.msgpack.encode(value))
         if size > self.most_bytes:

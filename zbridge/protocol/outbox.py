@@ -54,7 +54,7 @@ class _Group:
         self.spacing_s = spacing_s
 
     def step(self, now: float) -> bytes:
-        """Give the next frame of the group."""
+        """Return the next frame of the group."""
         frame = self.frames[self.position]
         self.position += 1
         if self.position == len(self.frames):
@@ -174,7 +174,7 @@ class Outbox(Kept):
             new.position = old.position
 
     def prolong(self, slot: str, frames: tuple[bytes, ...], *, period_s: float, until: float) -> bool:
-        """Repeat what ``slot`` holds until then, at the times it has anyway; False where it holds other frames.
+        """Repeat what ``slot`` holds until then, at the times it has anyway; False if it holds other frames.
 
         Frames that somebody says again and again so leave evenly: a peer that reads seldom joins what comes closer.
         """
@@ -199,7 +199,7 @@ class Outbox(Kept):
             self._queue.remove(frame)
 
     def is_set(self, slot: str) -> bool:
-        """Tell whether ``slot`` holds a group."""
+        """Return whether ``slot`` holds a group."""
         return slot in self._slots
 
     def take(self, now: float) -> bytes | None:
@@ -233,7 +233,7 @@ class Outbox(Kept):
         return frame
 
     def deadline(self) -> float | None:
-        """Give the time at which :meth:`take` has a frame; None: all queues and slots are empty."""
+        """Return the time at which :meth:`take` has a frame; None: all queues and slots are empty."""
         if self._exempt:
             return self._free_at
         free_at = max(self._free_at, self._quiet_until)
@@ -244,12 +244,12 @@ class Outbox(Kept):
         return max(free_at, min(group.due for group in self._slots.values()))
 
     def due(self, now: float) -> bool:
-        """Tell whether :meth:`take` may have a frame now."""
+        """Return whether :meth:`take` may have a frame now."""
         at = self.deadline()
         return at is not None and at <= now
 
     def _hurries(self, group: tuple[bytes, ...]) -> bool:
-        """Tell whether a group still waits among the urgent frames, whole and in its order."""
+        """Return whether a group still waits among the urgent frames, whole and in its order."""
         if len(group) == 1:
             return group[0] in self._urgent
         urgent = tuple(self._urgent)

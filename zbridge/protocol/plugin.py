@@ -66,7 +66,7 @@ class RobotSide(Kept, ABC):
 
     @abstractmethod
     def translator(self, kind: type) -> Translate:
-        """Give the function that translates messages of one class; asked once for each class."""
+        """Return the function that translates messages of one class; asked once for each class."""
 
     def telemetry(self, message: Any, stamp_ns: int) -> Iterable[Telemetry]:
         """Translate one message of the robot; raise ProtocolError if it has no meaning."""
@@ -93,7 +93,7 @@ class RobotSide(Kept, ABC):
         return math.inf
 
     def stop_frames(self) -> tuple[bytes, ...]:
-        """Give the frames of a stop as the driving session would write them now; change nothing.
+        """Return the frames of a stop as the driving session would write them now; change nothing.
 
         Somebody else writes them if this process dies. Empty: nobody can stop the robot then.
         """
@@ -104,7 +104,7 @@ class RobotSide(Kept, ABC):
         """Ask the robot for what it publishes on ``topic``; raise Refused if it cannot be asked."""
 
     def known(self, topic: Topic) -> FleetMessage | None:
-        """Give the answer to a query for ``topic`` that is known already; None: :meth:`ask` the robot."""
+        """Return the answer to a query for ``topic`` that is known already; None: :meth:`ask` the robot."""
         return None
 
     @property
@@ -196,7 +196,7 @@ class HqSide(Kept, ABC):
         return None
 
     def deadline(self, session: Any) -> float:
-        """Give the time of the next :meth:`expire` for a client; ``inf``: never."""
+        """Return the time of the next :meth:`expire` for a client; ``inf``: never."""
         return math.inf
 
     def expire(self, session: Any, now: float) -> Iterable[Telemetry]:
@@ -223,7 +223,7 @@ class HqSide(Kept, ABC):
         return command.moving
 
     def attend(self, client: RobotUser) -> None:
-        """ReadPayload after a client that holds the robot; called every :data:`ATTEND_S`.
+        """Attend to a client that holds the robot; called every :data:`ATTEND_S`.
 
         Legacy programs repeat their motion, or the deadman ends it. For those that set it once, override this.
         """

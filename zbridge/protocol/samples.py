@@ -59,7 +59,7 @@ class KeyedSample(msgspec.Struct, frozen=True):
 
     @property
     def count(self) -> int:
-        """The number of samples that DROPPED tells of; raises ProtocolError where it tells none."""
+        """The number of samples that DROPPED tells of; raises ProtocolError if it tells none."""
         if len(self.payload) != _COUNT.size:
             raise ProtocolError(f"DROPPED of {len(self.payload)} bytes: expected {_COUNT.size}")
         return int(_COUNT.unpack(self.payload)[0])
@@ -87,7 +87,7 @@ def write_sample(sample: KeyedSample) -> bytes:
 
 
 def read_sample(frame: bytes) -> KeyedSample:
-    """Read a frame; raise ProtocolError where it is none."""
+    """Read a frame; raise ProtocolError if it is none."""
     if sample_end(frame, 0) != len(frame):
         raise ProtocolError(f"sample of {len(frame)} bytes is cut off")
     _, kind, key_bytes, told, stamp_ns = _HEADER.unpack_from(frame)

@@ -97,11 +97,11 @@ class Session(KeptSession, ABC, Generic[M]):
 
     @abstractmethod
     def encode(self, message: M) -> bytes:
-        """Write a message as one frame; raise EncodeError where it cannot be."""
+        """Write a message as one frame; raise EncodeError if it cannot be."""
 
     @abstractmethod
     def decode(self, frame: bytes) -> M:
-        """Read one frame; raise ProtocolError where it is none of this protocol's messages."""
+        """Read one frame; raise ProtocolError if it is none of this protocol's messages."""
 
     def opened(self, now: float) -> None:
         """Take the first step of the handshake."""
@@ -111,28 +111,28 @@ class Session(KeptSession, ABC, Generic[M]):
         """Handle a message of the handshake, or of a class in ``handled``; True hands it on to the translator."""
 
     def claims(self, datagram: bytes, port: int) -> bool:
-        """Tell whether a datagram from a port of the peer's host that is nobody's source yet is from the peer."""
+        """Return whether a datagram from a port of the peer's host that is nobody's source yet is from the peer."""
         return False
 
     def rivalled(self, now: float) -> None:
         """React to a second source, or session, with the same claim; the peer has no source of datagrams any more."""
 
     def stray(self, datagram: bytes) -> None:
-        """ReadPayload at a datagram of the peer's host that nobody claimed; raise Refused to tell the peer why."""
+        """Inspect a datagram of the peer's host that nobody claimed; raise Refused to notify the peer."""
 
     def timers(self) -> float:
-        """Give the time of the next :meth:`on_timer`; ``inf``: never."""
+        """Return the time of the next :meth:`on_timer`; ``inf``: never."""
         return math.inf
 
     def on_timer(self, now: float) -> None:
         """Run the protocol's own timers that are due."""
 
     def undated(self, frame: bytes) -> bytes:
-        """Give a written frame without what each writing changes, as numbers and times; for the conformance kit."""
+        """Return a written frame without what each writing changes, as numbers and times; for the conformance kit."""
         return frame
 
     def overdue(self) -> str:
-        """Give the reason for a handshake that was not finished in time."""
+        """Return the reason for a handshake that was not finished in time."""
         return f"no handshake within {self.limits.handshake_s:g} s"
 
     # What a driver calls
@@ -230,7 +230,7 @@ class Session(KeptSession, ABC, Generic[M]):
         return frame
 
     def deadline(self, *, writing: bool = True) -> float | None:
-        """Give the time of the next :meth:`expire` and :meth:`outgoing`; None: never.
+        """Return the time of the next :meth:`expire` and :meth:`outgoing`; None: never.
 
         ``writing`` False leaves out the frames that wait: the link takes nothing now.
         """

@@ -52,7 +52,7 @@ class KeptSession(Kept):
         return state | {PARTIAL: list(self._frames.partial() or ())} if budget is None else state
 
     def partial(self, most_bytes: int) -> Partial | None:
-        """Describe the incomplete frame in ``most_bytes`` at most; None where that is not possible."""
+        """Describe the incomplete frame in ``most_bytes`` at most; None if that is not possible."""
         return self._frames.partial(most_bytes)
 
     def restore(self, state: Exported) -> None:

@@ -31,7 +31,7 @@ class Backoff:
         return f"<Backoff next {self._next_s:g} s>"
 
     def delay_s(self) -> float:
-        """Give the next delay, seconds."""
+        """Return the next delay, seconds."""
         delay_s, self._next_s = self._next_s, min(self._most_s, 2 * self._next_s)
         return delay_s * (0.75 + 0.5 * self._chance())
 
@@ -54,7 +54,7 @@ class ClientIds(Kept):
         return f"<ClientIds {taken} of {len(self._free_at)} taken>"
 
     def take(self, now: float) -> int | None:
-        """Give the lowest id that is free now; None: all are taken."""
+        """Return the lowest id that is free now; None: all are taken."""
         for client_id, free_at in self._free_at.items():
             if free_at <= now:
                 self._free_at[client_id] = math.inf

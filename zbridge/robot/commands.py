@@ -81,7 +81,7 @@ class Commands:
         self._enforcer.settle()
 
     def require_ready(self) -> Session[object]:
-        """Return the session that takes commands; raise Refused where the robot takes none now."""
+        """Return the session that takes commands; raise Refused if the robot takes none now."""
         session = self._robot.driving
         if session is None or (session.state is not _ESTABLISHED and session.over):
             raise NotReady("offline")
@@ -90,7 +90,7 @@ class Commands:
         return session
 
     def require_flowing(self) -> None:
-        """Raise Refused where the robot's link is stalled: what waits for it would come after the stop."""
+        """Raise Refused if the robot's link is stalled: what waits for it would come after the stop."""
         if self.blocked:
             raise NotReady(LINK_BLOCKED)
 
@@ -144,7 +144,7 @@ class Commands:
         self._enforcer.settle()
 
     def _require_allowed(self, command: FleetMessage, sender: CommandSender | None) -> None:
-        """Raise Refused where a command that is no drive must not reach the robot now."""
+        """Raise Refused if a command that is no drive must not reach the robot now."""
         session = self.require_ready()
         self.require_flowing()
         if sender is not None and (isinstance(command, Raw) or _is_autonomous(command)):
@@ -208,7 +208,7 @@ def _is_autonomous(command: FleetMessage) -> bool:
 
 
 def _require_sure(session: Session[object]) -> None:
-    """Raise Refused where the robot is not to be set in motion: a later stop might not arrive."""
+    """Raise Refused if the robot is not to be set in motion: a later stop might not arrive."""
     doubt = session.doubtful
     if doubt is not None:
         raise NotReady(doubt)

@@ -41,7 +41,7 @@ class Router:
         return f"<Router {' '.join(self._plan.settings.listen)}>"
 
     async def run(self) -> None:
-        """Route until cancelled; raise ConfigError where an address or a TLS file cannot be used."""
+        """Route until cancelled; raise ConfigError if an address or a TLS file cannot be used."""
         settings = self._plan.settings
         with prefixed(f"no router at {', '.join(settings.listen)}: ", BusError):
             bus = await open_router(zenoh_values(self._plan), Metrics(), self.note)

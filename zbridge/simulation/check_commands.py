@@ -145,7 +145,7 @@ def _question(protocol: Protocol, recording: Transcript, topic: Topic) -> CheckF
 
 
 def _carry_out(rehearsal: Rehearsal, topic: Topic, command: FleetMessage) -> str:
-    """Give what became of a command; an empty text where nothing did."""
+    """Return what became of a command; an empty text where nothing did."""
     idle = set(rehearsal.run(WATCHED_S))
     outcome = _give(rehearsal, topic, command)
     if outcome:

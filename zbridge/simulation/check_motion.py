@@ -88,13 +88,13 @@ async def _turn(scene: Stage, clock: Callable[[], float], full_rad_s: float) -> 
 
 
 def _full(protocol: Protocol, option: str) -> float:
-    """Give what the options say of full scale; 0 where they do not."""
+    """Return what the options say of full scale; 0 where they do not."""
     value = getattr(msgspec.convert(protocol.simulated, protocol.options), option, 0.0)
     return value if isinstance(value, float) else 0.0
 
 
 def _unlike(seen: float, expected: float, unit: str) -> str | None:
-    """Tell whether a way or a turn is not what the options promise; ``expected`` 0: they promise nothing."""
+    """Return whether a way or a turn is not what the options promise; ``expected`` 0: they promise nothing."""
     if not expected or expected / FACTOR <= seen <= expected * FACTOR:
         return None
     return f"{seen:.3f} {unit}, but the options say {expected:.3f} {unit}"
@@ -128,7 +128,7 @@ class _Seen:
         return (last.x - first.x) * math.cos(first.heading) + (last.y - first.y) * math.sin(first.heading)
 
     def moves(self, idle: _Seen, expected_m: float) -> CheckFinding:
-        """Tell whether it moved, or at least was commanded so."""
+        """Return whether it moved, or at least was commanded so."""
         claim = "the simulated robot drives"
         if not self.poses and not self.speeds:
             commanded = bool(self.written - idle.written)
@@ -142,7 +142,7 @@ class _Seen:
         return CheckFinding(claim, None, f"{self.way_m:.2f} m" if self.poses else "by its speed")
 
     def stands(self, stop: _Seen, drive: _Seen) -> CheckFinding:
-        """Tell whether it stood after the stop, or at least was commanded so."""
+        """Return whether it stood after the stop, or at least was commanded so."""
         claim = "the simulated robot stands after its stop"
         if not self.poses and not self.speeds:
             commanded = bool(stop.written - drive.written)

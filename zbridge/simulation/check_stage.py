@@ -63,7 +63,7 @@ class CheckFinding(msgspec.Struct, frozen=True):
 
 
 def raised(error: BaseException, expected: str = "") -> str:
-    """Say what the protocol's own code raised, in which class and line, and what was expected instead."""
+    """Return what the protocol's own code raised, in which class and line, and what was expected instead."""
     return f"{describe(error)}; expected {expected}" if expected else describe(error)
 
 
@@ -241,7 +241,7 @@ class Rehearsal:
         return len(self._recording.received)
 
     def run(self, seconds: float, *, answers: bool = True) -> list[bytes]:
-        """Let time pass and write what is due; give what was written. Raise RuntimeError where that never ends.
+        """Let time pass and write what is due; give what was written. Raise RuntimeError if that never ends.
 
         ``answers``: the robot says what it said after the same frame, once the session is established.
         """

@@ -103,15 +103,15 @@ class MessageReader(Generic[M]):
         return messages
 
     def _lost(self, data: bytes) -> str:
-        """Tell why the length of the message at the start of ``data`` is unknowable, empty if it is not."""
+        """Return why the length of the message at the start of ``data`` is unknowable, empty if it is not."""
         raise NotImplementedError
 
     def _lose(self, problem: str, after: int) -> M:
-        """Give a message for what cannot be framed, ``after`` others in this read; set ``dead`` or clear ``rest``."""
+        """Return a message for what cannot be framed, ``after`` others in this read; set ``dead`` or clear ``rest``."""
         raise NotImplementedError
 
     def _size(self, data: bytes) -> int:
-        """Give the bytes of the message, or as many as are needed to know."""
+        """Return the bytes of the message, or as many as are needed to know."""
         raise NotImplementedError
 
     def _read(self, raw: bytes) -> M:

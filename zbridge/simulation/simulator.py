@@ -73,7 +73,7 @@ class Simulator(ABC, Generic[M]):
     # What a protocol calls
 
     def clients(self, link: str | None = None) -> Iterator[Conversation]:
-        """Give the clients whose sessions are established, of one link or of all."""
+        """Return the clients whose sessions are established, of one link or of all."""
         for client, name in tuple(self._clients.items()):
             if link in (None, name) and client.session.state is State.ESTABLISHED:
                 yield client

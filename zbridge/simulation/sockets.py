@@ -43,7 +43,7 @@ def bind_tcp_and_udp(host: str, port: int) -> tuple[socket.socket, socket.socket
 
 @contextlib.asynccontextmanager
 async def connected(host: str, port: int, options: Iterable[tuple[int, int, int]] = ()) -> AsyncIterator[socket.socket]:
-    """Connect, every write a segment of its own; ``options`` are set before; raise OSError where nobody listens."""
+    """Connect, every write a segment of its own; ``options`` are set before; raise OSError if nobody listens."""
     with socket.socket(_family(host)) as tcp:
         tcp.setblocking(False)
         send_at_once(tcp)

@@ -119,7 +119,7 @@ class ReadingThread(threading.Thread):
 
 
 def _stamp(stamps: Sequence[tuple[int, int, bytes]]) -> float:
-    """Give the time of day when the kernel took the last byte read; now where it does not tell."""
+    """Return the time of day when the kernel took the last byte read; now where it does not tell."""
     for level, kind, data in stamps:
         if (level, kind, len(data)) == (socket.SOL_SOCKET, _STAMPS, 16):
             seconds, nanoseconds = struct.unpack("qq", data)
@@ -128,7 +128,7 @@ def _stamp(stamps: Sequence[tuple[int, int, bytes]]) -> float:
 
 
 def _waited_s() -> float:
-    """Give how long this thread was ready to run without a processor so far; 0 where the system does not tell."""
+    """Return how long this thread was ready to run without a processor so far; 0 where the system does not tell."""
     with contextlib.suppress(OSError, ValueError, IndexError), open("/proc/thread-self/schedstat", "rb") as file:
         return int(file.read().split()[1]) * 1e-9
     return 0.0

@@ -22,7 +22,7 @@ class Backlog:
         """For each write: the bytes written up to its end, and when."""
         self._written = 0
         self.since: float | None = None
-        """When the oldest byte was written that is not known to be acknowledged; None where there is none."""
+        """When the oldest byte was written that is not known to be acknowledged; None if there is none."""
 
     def __repr__(self) -> str:
         return f"<Backlog of {len(self._entries)} writes>"

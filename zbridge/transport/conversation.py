@@ -311,7 +311,7 @@ class Conversation:
 
     @property
     def blocker(self) -> str | None:
-        """Why the conversation cannot be handed to another process now; None where it can."""
+        """Why the conversation cannot be handed to another process now; None if it can."""
         link = self._link
         if link is None or self.session.over:
             return "the connection is not up"
@@ -362,7 +362,7 @@ class Conversation:
             self.session.expire(now)
 
     def _deadline(self, now: float, *, writing: bool) -> float | None:
-        """Give the time of the next tick; ``writing`` False: the link takes nothing now."""
+        """Return the time of the next tick; ``writing`` False: the link takes nothing now."""
         if now >= self._reads_until:
             return self.session.deadline(writing=writing)
         writes_at = self.session.outbox.deadline() if writing else None

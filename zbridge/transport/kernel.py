@@ -37,7 +37,7 @@ class Kernel(Protocol):
         """Bind a UDP socket that does not block; raise OSError."""
 
     def unacknowledged(self, sock: socket.socket) -> int:
-        """Count the bytes that the peer has not acknowledged; raise OSError where the platform does not tell."""
+        """Count the bytes that the peer has not acknowledged; raise OSError if the platform does not tell."""
 
 
 class _Kernel:

@@ -29,13 +29,13 @@ class Receiver(Protocol):
         """Take a datagram from the peer."""
 
     def claims(self, datagram: bytes, port: int) -> bool:
-        """Tell whether a datagram from a port of the peer's host that is nobody's source yet is from the peer."""
+        """Return whether a datagram from a port of the peer's host that is nobody's source yet is from the peer."""
 
     def rivalled(self) -> None:
         """React to a second source, or a second receiver, with the same claim: the peer has no source any more."""
 
     def stray_datagram(self, datagram: bytes) -> None:
-        """ReadPayload at a datagram of the peer's host that nobody claimed; the link has dropped it."""
+        """Inspect a datagram of the peer's host that nobody claimed; the link has dropped it."""
 
     def foreign_datagram(self) -> None:
         """Count a datagram from elsewhere; the link has dropped it."""
@@ -92,7 +92,7 @@ class Link(Protocol):
 
     @property
     def blocker(self) -> str | None:
-        """Why this connection cannot be handed to another process; None where it can."""
+        """Why this connection cannot be handed to another process; None if it can."""
 
     def suspend(self) -> None:
         """Read nothing, neither stream nor datagrams, until :meth:`resume`: another process may do so meanwhile."""

@@ -241,7 +241,7 @@ _closing: set[asyncio.Task[bool]] = set()
 
 
 async def connect(address: ZenohAddress, receiver: Receiver) -> ZenohLink:
-    """Open a session that is a client of the router at ``address``; raise LinkError where there is none."""
+    """Open a session that is a client of the router at ``address``; raise LinkError if there is none."""
     settings = BusSettings(mode="client", connect=(address.endpoint,), multicast=False)
     link = await _opened(str(address), settings, receiver)
     link.begin(ends=True)
@@ -250,7 +250,7 @@ async def connect(address: ZenohAddress, receiver: Receiver) -> ZenohLink:
 
 @contextlib.asynccontextmanager
 async def serve(address: Address, receiver: Receiver) -> AsyncIterator[ZenohLink]:
-    """Open a router at ``address``, which is itself the session of ``receiver``; raise LinkError where it cannot be."""
+    """Open a router at ``address``, which is itself the session of ``receiver``; raise LinkError if it cannot be."""
     settings = BusSettings(mode="router", listen=(f"tcp/{address.host}:{address.port}",), multicast=False)
     link = await _opened(str(address), settings, receiver)
     link.begin(ends=False)

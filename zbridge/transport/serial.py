@@ -191,7 +191,7 @@ class SerialLink:
                 self._receiver.writable()
 
     def _close_when_sent(self) -> None:
-        """ReadPayload until the output queue is empty, or time is up: the kernel itself would block in ``close``."""
+        """Poll until the output queue is empty, or time is up: the kernel itself would block in ``close``."""
         if not self._open or self._close_by is None:
             return
         if self._unsent() and self._loop.time() < self._close_by:
@@ -264,7 +264,7 @@ def _opened(address: SerialAddress) -> Any:
 
 
 def _explained(error: Exception) -> str:
-    """Tell why a line could not be opened; pyserial's errors repeat the path and hide the number."""
+    """Return why a line could not be opened; pyserial's errors repeat the path and hide the number."""
     number = getattr(error, "errno", None)
     if number in (errno.EAGAIN, errno.EBUSY):
         return "another program uses this line"

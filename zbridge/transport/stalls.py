@@ -23,7 +23,7 @@ class Stalls:
         return f"<Stalls {'blocked' if self.blocked else 'none'}>"
 
     def takes(self, link: Link) -> bool:
-        """Tell whether the link is not stalled. A stall ends when the last byte is acknowledged."""
+        """Return whether the link is not stalled. A stall ends when the last byte is acknowledged."""
         waited_s = link.unacknowledged_s
         blocked = waited_s > (0.0 if self.blocked else STALLED_S)
         if blocked is not self.blocked:
@@ -32,7 +32,7 @@ class Stalls:
         return not blocked
 
     def next(self, deadline: float | None, link: Link | None) -> float | None:
-        """Give the next time to act: the session's deadline, or the next check for a stall."""
+        """Return the next time to act: the session's deadline, or the next check for a stall."""
         waited_s = link.unacknowledged_s if link is not None else 0.0
         if not waited_s and not self.blocked:
             return deadline

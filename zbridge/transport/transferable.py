@@ -81,7 +81,7 @@ class Parcel:
         return len(self.descriptors) - 1
 
     def take(self, number: object) -> int:
-        """Take a descriptor out, once; raise ProtocolError where there is none of this number."""
+        """Take a descriptor out, once; raise ProtocolError if there is none of this number."""
         if not isinstance(number, int) or not 0 <= number < len(self.descriptors) or number in self._taken:
             raise ProtocolError(f"no descriptor {number!r} among {len(self.descriptors)}")
         self._taken.add(number)

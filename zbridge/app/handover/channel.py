@@ -45,7 +45,7 @@ class Hello(msgspec.Struct, tag="hello", frozen=True):
 class HandoverState(msgspec.Struct, tag="given", frozen=True):
     """Gateway: nothing is read or written any more; take this over, and ``descriptors`` descriptors behind it.
 
-    setup: what must be the same in both configurations. claim: on the robot, None where it is not owned. device: None
+    setup: what must be the same in both configurations. claim: on the robot, None if it is not owned. device: None
     where it is not served. listeners: in the order of the configuration; none of a gateway that died: the successor
     binds its own. metrics: numbers of sockets in the parcel. partials: of a gateway that died, the incomplete frame of
     each stream, in the order of the device's links.

@@ -87,7 +87,7 @@ class Successor(Protocol):
     """Who starts successors of this process."""
 
     async def start_successor(self, far_end: socket.socket) -> None:
-        """Start a process that owns the far end; raise HandoverError where none can be started.
+        """Start a process that owns the far end; raise HandoverError if none can be started.
 
         The caller closes its own copy of the far end afterwards, in any case.
         """
@@ -138,7 +138,7 @@ class Spawn:
 
 
 class Systemd:
-    """The socket that systemd named in the environment (``sd_notify``); does nothing where it named none.
+    """The socket that systemd named in the environment (``sd_notify``); does nothing if it named none.
 
     watchdog_s: seconds between two notifications of the watchdog; 0: none is wanted.
     """

@@ -129,12 +129,12 @@ class Outgoing:
             raise HandoverError("the gateway ends")
 
     def _require_same_parts(self) -> None:
-        """Raise NotReady where the robot was taken, or left, since the parts were stopped."""
+        """Raise NotReady if the robot was taken, or left, since the parts were stopped."""
         if list(self._find_parts()) != list(self._parts):
             raise NotReady("the robot was acquired or left to another gateway meanwhile: try again")
 
     async def _receive(self, channel: HandoverChannel, kind: type[M], within_s: float) -> M:
-        """Wait for a message of the successor; raise HandoverError where the gateway ends meanwhile."""
+        """Wait for a message of the successor; raise HandoverError if the gateway ends meanwhile."""
         message = asyncio.ensure_future(channel.receive(kind, within_s))
         ends = asyncio.ensure_future(self._ends.wait())
         try:

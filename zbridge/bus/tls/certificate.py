@@ -30,12 +30,12 @@ class Certificate(msgspec.Struct, frozen=True):
 
     @property
     def role(self) -> str:
-        """The role in a common name ``role.name``; empty where it is not of this form."""
+        """The role in a common name ``role.name``; empty if it is not of this form."""
         return self.common_name.partition(".")[0] if self.name else ""
 
     @property
     def name(self) -> str:
-        """The name in a common name ``role.name``; empty where it is not of this form."""
+        """The name in a common name ``role.name``; empty if it is not of this form."""
         return self.common_name.partition(".")[2]
 
 

@@ -43,7 +43,7 @@ def tls_beside(tls: Tls, folder: Path) -> Tls:
 def folder_settings(folder: Path, endpoints: Sequence[str] = ()) -> BusSettings:
     """Return how a program joins the bus with a folder: by these endpoints, else by those of its ``bus.toml``.
 
-    Raises ConfigError where there is no such folder, or neither names a router.
+    Raises ConfigError if there is no such folder, or neither names a router.
     """
     if not folder.is_dir():
         raise ConfigError(f"--tls {folder}: no such folder; expected one as `zbridge certs bundle` makes it")
@@ -66,14 +66,14 @@ def _routers(folder: Path) -> tuple[str, ...]:
 
 
 def own_certificate(tls: Tls | None) -> Certificate | None:
-    """Return what the certificate of these settings says; None where there is none; raise ConfigError."""
+    """Return what the certificate of these settings says; None if there is none; raise ConfigError."""
     return read_certificate(Path(tls.certificate)) if tls is not None and tls.certificate is not None else None
 
 
 def own_name(tls: Tls | None) -> str | None:
     """Return the name in the common name ``role.name`` of our certificate, to which the router binds keys.
 
-    None where there is none of this form. Raises ConfigError if the certificate cannot be read.
+    None if there is none of this form. Raises ConfigError if the certificate cannot be read.
     """
     certificate = own_certificate(tls)
     return (certificate.name or None) if certificate is not None else None
@@ -86,7 +86,7 @@ def own_role(tls: Tls | None) -> str | None:
 
 
 def unusable(tls: Tls) -> str | None:
-    """Say why no connection can be made with these files, whatever the time is; None where one can."""
+    """Return why no connection can be made with these files, whatever the time is; None if one can."""
     try:
         read_certificate(Path(tls.ca))
         if own_certificate(tls) is None or tls.key is None:
@@ -98,7 +98,7 @@ def unusable(tls: Tls) -> str | None:
 
 
 def out_of_date(certificate: Certificate, now: datetime) -> str | None:
-    """Say that a certificate is not valid now; None where it is."""
+    """Return that a certificate is not valid now; None if it is."""
     if certificate.ends <= now:
         renew = f"; `zbridge certs renew {certificate.name}`" if certificate.name else ""
         return f"the certificate of {certificate.common_name} expired on {certificate.ends:%Y-%m-%d %H:%M} UTC{renew}"
@@ -111,7 +111,7 @@ def out_of_date(certificate: Certificate, now: datetime) -> str | None:
 
 
 def ends_soon(certificate: Certificate, now: datetime) -> str | None:
-    """Warn of a certificate that ends within :data:`WARN`; None where it is valid for longer."""
+    """Warn of a certificate that ends within :data:`WARN`; None if it is valid for longer."""
     if now < certificate.ends - WARN:
         return None
     return out_of_date(certificate, now) or (
@@ -135,7 +135,7 @@ def client_context(tls: Tls) -> ssl.SSLContext:
 
 
 def is_of_authority(tls: Tls) -> bool:
-    """Tell whether the authority has signed the certificate, whatever the time is, by a handshake in memory."""
+    """Return whether the authority has signed the certificate, whatever the time is, by a handshake in memory."""
     server, client = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     client.check_hostname, client.verify_mode = False, ssl.CERT_NONE
     server.verify_mode = ssl.CERT_REQUIRED

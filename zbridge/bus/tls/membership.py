@@ -74,7 +74,7 @@ async def require_member(
 
 
 async def lacking(ask: Ask, realm: str, name: str, robot: str, right: Right) -> str | None:
-    """Say which role a program lacks; None where it has one, or nothing is known: no router answers, the bus is open.
+    """Return which role a program lacks; None if it has one, or nothing is known: no router answers, the bus is open.
 
     Ask this when a query had no answer: what a role may not ask, a router drops without a word. name: in the
     certificate.

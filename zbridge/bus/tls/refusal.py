@@ -43,7 +43,7 @@ class Finding(msgspec.Struct, frozen=True):
 
 
 async def why_not(settings: BusSettings, *, ask: bool = True) -> Finding | None:
-    """Say why none of the endpoints could be connected to; None where nothing is found to be wrong.
+    """Return why none of the endpoints could be connected to; None if nothing is found to be wrong.
 
     ask: connect to them; else only our own files are looked at. A router pays for each connection that says nothing.
     """
@@ -61,7 +61,7 @@ async def why_not(settings: BusSettings, *, ask: bool = True) -> Finding | None:
 
 
 def own_fault(tls: Tls | None) -> str | None:
-    """Say what is wrong with our own files; None where nothing is."""
+    """Return what is wrong with our own files; None if nothing is."""
     if tls is None:
         return None
     try:
@@ -72,7 +72,7 @@ def own_fault(tls: Tls | None) -> str | None:
 
 
 def ask_endpoint(endpoint: str, tls: Tls | None) -> Finding | None:
-    """Say why this endpoint takes no connection, by connecting to it; None where it seems to."""
+    """Return why this endpoint takes no connection, by connecting to it; None if it seems to."""
     kind, _, address = endpoint.partition("/")
     host, _, port = address.partition("#")[0].partition("?")[0].rpartition(":")
     if kind not in ("tcp", "tls") or not port.isdigit():
@@ -102,7 +102,7 @@ def ask_endpoint(endpoint: str, tls: Tls | None) -> Finding | None:
 def _shake_hands(
     link: socket.socket, at: str, host: str, tls: Tls | None, kind: str, deadline: float
 ) -> Finding | None:
-    """Shake hands, and hear what the router thinks of our certificate; None where no TLS came back."""
+    """Shake hands, and hear what the router thinks of our certificate; None if no TLS came back."""
     if tls is not None:
         context, certificate = client_context(tls), own_certificate(tls)
     else:
@@ -131,7 +131,7 @@ def _shake_hands(
 
 
 def _is_plain(host: str, port: int, deadline: float) -> bool:
-    """Tell whether nonsense ends a connection at once, or is answered: so do routers of plain TCP, and many others."""
+    """Return whether garbage ends a connection at once, or is answered, as by routers of plain TCP and many others."""
     with socket.create_connection((host, port), _left(deadline)) as link:
         link.settimeout(min(_left(deadline), _PLAIN_S))
         try:
@@ -149,13 +149,13 @@ def _tls_there(at: str) -> Finding:
 
 
 def _untrusted(error: ssl.SSLCertVerificationError, at: str, host: str, tls: Tls | None) -> str:
-    """Say why we do not accept the router's certificate."""
+    """Return why we do not accept the router's certificate."""
     why = _DISTRUST.get(error.verify_code, f"is not valid: {error.verify_message}")
     return f"the certificate of the router at {at} {why.format(host=host, ca=tls.ca if tls is not None else '')}"
 
 
 def _said_no(reason: str, at: str, certificate: Certificate | None) -> str:
-    """Say why the router does not accept ours."""
+    """Return why the router does not accept ours."""
     if certificate is None:
         return f"{at} wants a certificate, and we showed none: give --tls FOLDER, or bus.tls with certificate and key"
     why = next((text for part, text in _REFUSALS if part in reason), f"it says {reason.lower().replace('_', ' ')}")
@@ -196,7 +196,7 @@ def _left(deadline: float) -> float:
 async def _on_thread(
     work: Callable[[str, Tls | None], Finding | None], endpoint: str, tls: Tls | None
 ) -> Finding | None:
-    """Run what blocks on a thread that nobody waits for in the end; None where it takes too long, or fails itself."""
+    """Run what blocks on a thread that nobody waits for in the end; None if it takes too long, or fails itself."""
     loop = asyncio.get_running_loop()
     done: asyncio.Future[Finding | None] = loop.create_future()
 

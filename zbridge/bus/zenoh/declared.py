@@ -113,7 +113,7 @@ def _undeclare_later(entity: Any) -> None:
 
 
 def _undeclare(entity: Any) -> bool:
-    """Undeclare an entity; False where its own callback runs and it must be tried again."""
+    """Undeclare an entity; False if its own callback runs and it must be tried again."""
     try:
         entity.undeclare()
     except RuntimeError as error:

@@ -133,7 +133,7 @@ async def open_or_say_why(config: zenoh.Config, settings: BusSettings, *, explai
 
 
 async def open_session(config: zenoh.Config) -> zenoh.Session:
-    """Open a session; raise BusError where that is not possible."""
+    """Open a session; raise BusError if that is not possible."""
     try:
         return await asyncio.to_thread(zenoh.open, config)
     except zenoh.ZError as error:

@@ -28,7 +28,7 @@ _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 async def open_router(
     values: Mapping[str, Any], metrics: Metrics, on_neighbour: Callable[[Neighbour, bool], None]
 ) -> ZenohBus:
-    """Open a router; raise BusError where that is not possible."""
+    """Open a router; raise BusError if that is not possible."""
     values = {**values, "id": router_id()}
     router = ZenohRouter(await open_session(write_config(values)), asyncio.get_running_loop(), metrics)
     router.watch_neighbours(on_neighbour)

@@ -61,7 +61,7 @@ async def open_zenoh(
     explain: bool = True,
     threads: bool = True,
 ) -> ZenohBus:
-    """Open a Zenoh session; raise BusError where that is not possible (a client: no router within ``within_s``)."""
+    """Open a Zenoh session; raise BusError if that is not possible (a client: no router within ``within_s``)."""
     config = zenoh_config(
         settings, wait_for_peers=wait_for_peers, bounds=bounds, within_s=within_s, timestamps=timestamps
     )
@@ -293,7 +293,7 @@ class ZenohBus:
         return self._keep(ConnectedWatch(self._session.info, self._loop, handler))
 
     async def close(self) -> bool:
-        """Leave the bus within :data:`LEAVE_S`; False where that hangs, as with a router that has stalled."""
+        """Leave the bus within :data:`LEAVE_S`; False if that hangs, as with a router that has stalled."""
         handles, self._handles = self._handles, []
         if self._inbox in self._inboxes:
             self._inboxes.remove(self._inbox)

@@ -45,7 +45,7 @@ def load_name(folder: Folder, name: str) -> tuple[EllipticCurvePrivateKey, Certi
 
 
 def fault(certificate: Certificate, authority: Certificate, expected: str, now: datetime) -> str:
-    """Say why a certificate would be refused, or be nobody's; empty: it would not. expected: its common name."""
+    """Return why a certificate would be refused, or be nobody's; empty: it would not. expected: its common name."""
     if not x509.issued_by(certificate, authority):
         return "issued by another authority"
     if (found := x509.common_name_of(certificate)) != expected:

@@ -96,7 +96,7 @@ def check_host(text: str) -> str:
 
 
 def is_reachable(host: str) -> bool:
-    """Tell whether Zenoh connects to a host by TLS. It takes ``tls/[::1]:7447`` for a name, and refuses it."""
+    """Return whether Zenoh connects to a host by TLS. It takes ``tls/[::1]:7447`` for a name, and refuses it."""
     return ":" not in host
 
 
@@ -150,7 +150,7 @@ def fingerprint(certificate: x509.Certificate) -> str:
 
 
 def issued_by(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
-    """Tell whether an authority has signed a certificate."""
+    """Return whether an authority has signed a certificate."""
     try:
         certificate.verify_directly_issued_by(authority)
     except (InvalidSignature, ValueError, TypeError):

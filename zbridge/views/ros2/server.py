@@ -46,7 +46,7 @@ async def serve(plan: Ros2Plan, bus: BusSettings, metrics: Metrics, on_ready: Ca
 
 
 def require_two_routers(fleet: Bus, ros: Bus, plan: Ros2Plan) -> None:
-    """Raise ConfigError where both sessions are at one router: a fleet's rules do not know ROS's keys."""
+    """Raise ConfigError if both sessions are at one router: a fleet's rules do not know ROS's keys."""
     if set(fleet.routers()) & set(ros.routers()) or fleet.zid in ros.routers():
         where = ", ".join(plan.router.connect)
         raise ConfigError(

@@ -353,6 +353,6 @@ def test_over_any_course_of_events_the_robot_moves_only_for_its_one_driver() -> 
     run_state_machine_as_test(
         Driving,
         settings=settings(
-            max_examples=2 * settings().max_examples, stateful_step_count=50, deadline=None, print_blob=False
+            max_examples=settings().max_examples, stateful_step_count=50, deadline=None, print_blob=False
         ),
     )

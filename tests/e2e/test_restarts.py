@@ -70,7 +70,7 @@ async def test_old_hq_programs_stay_connected_and_drive_again_after_neutral(benc
         assert bench.fleet.last("r1/control")["holder"] == "hq.tcp.2"
 
     async with playing(program.run(HOST, tcp), vehicle.run(HOST, alf), controller.run(HOST, ec)):
-        await soon(lambda: program.position, "position")
+        await soon(lambda: program.position and bench.fleet.last("r1/pose"), "position")
         program.mode(2)
         program.idle()
         await drives()

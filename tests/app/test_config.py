@@ -289,12 +289,12 @@ ERRORS: list[tuple[dict[str, Any], str]] = [
     (serving(hq(listen="tls://a:1", tls={"key": "k"})), "hq[0].tls.certificate: missing"),
     (
         serving(hq(tls=TLS)),
-        "hq[0].listen = 'tcp://127.0.0.1:11002': expected tls://host:port, for there is a table tls",
+        "hq[0].listen = 'tcp://127.0.0.1:11002': expected tls://host:port, because there is a table tls",
     ),
     (serving(hq(listen="tls://a:1", tls=TLS)), "hq[0].tls: certificate '/none.pem' with key '/key.pem': No such file"),
     (serving(hq(), hq(listen="tls://127.0.0.1:11002", tls=TLS)), "hq[1].tls: certificate '/none.pem'"),
     # The camera
-    ({**serving(hq()), "camera": {"url": URL}}, "camera: expected only where there is a table device"),
+    ({**serving(hq()), "camera": {"url": URL}}, "camera: expected only with a table device"),
     (minimal(camera={}), "camera.url: missing, it is required"),
     (minimal(camera={"url": URL, "rate": 5}), "camera.rate = 5: unknown key; expected one of url, rate_hz, stall_s,"),
     *[

@@ -17,7 +17,7 @@ STALLED_S = 0.3
 
 
 class Receiver(Protocol):
-    """Takes what a link reads. All methods run on the event loop's thread."""
+    """Receives what a link reads. All methods run on the event loop's thread."""
 
     def attached(self, link: Link) -> None:
         """Start: the connection is up. Called once, before every other method."""
@@ -52,22 +52,22 @@ class Link(Protocol):
 
     peer: str
     reads: Callable[[], object]
-    """Called before bytes are taken from the kernel; set by who watches the link. :meth:`Receiver.received` follows,
-    with b"" where there were none."""
+    """Called before bytes are read from the kernel; set by the owner of the link. :meth:`Receiver.received` follows,
+    with b"" if there were none."""
 
     @property
     def descriptors(self) -> tuple[int, ...]:
-        """File descriptors: of the stream, then of the datagrams where there are any. Empty while there is no link."""
+        """File descriptors: of the stream, then of the datagrams if there are any. Empty while there is no link."""
 
     @property
     def ready(self) -> bool:
-        """Whether the link takes a write now; if not, :meth:`Receiver.writable` is called when it does."""
+        """Whether the link accepts a write now; if not, :meth:`Receiver.writable` is called when it does."""
 
     def write(self, data: bytes) -> None:
         """Write ``data`` as one segment."""
 
     def write_datagram(self, data: bytes) -> None:
-        """Send ``data`` as one datagram to the peer. It is lost if the network does not take it now."""
+        """Send ``data`` as one datagram to the peer. It is lost if the network does not accept it now."""
 
     def drop_source(self) -> None:
         """Forget which source an accepted peer's datagrams come from; idempotent."""
@@ -80,8 +80,8 @@ class Link(Protocol):
     def unacknowledged_s(self) -> float:
         """Seconds for which the oldest written byte has waited for its acknowledgement.
 
-        Exact above :data:`STALLED_S`; below, the byte may be acknowledged already. 0 only where nothing waits, or where
-        the platform does not tell.
+        Exact above :data:`STALLED_S`; below, the byte may be acknowledged already. 0 only if nothing waits, or if the
+        platform does not report it.
         """
 
     def pause_reading(self) -> None:
@@ -101,10 +101,10 @@ class Link(Protocol):
         """Read again, after :meth:`suspend`."""
 
     def export(self, parcel: Parcel) -> Exported:
-        """Put what the connection consists of into a parcel; describe it. The link must be suspended and ``ready``."""
+        """Put the connection's descriptors into a parcel; describe them. The link must be suspended and ``ready``."""
 
     def detach(self) -> None:
-        """Give up a connection that another process has now: neither the peer nor the receiver notices."""
+        """Detach a connection that another process has now: neither the peer nor the receiver notices."""
 
     def close(self) -> None:
         """Close the connection after what was written; idempotent."""
@@ -117,7 +117,7 @@ class Link(Protocol):
 
 
 class _Nobody:
-    """Takes nothing: the receiver of a link that was given up."""
+    """Ignores everything: the receiver of a link that was detached."""
 
     def attached(self, link: Link) -> None: ...
     def received(self, data: bytes) -> None: ...

@@ -4,8 +4,8 @@ The session is never the fleet's: it is a client of the robots' router, or is th
 simulated robots). Knows no robot and no format of keys, payloads and attachments.
 
 What comes is bounded before it is copied: :data:`RATE_HZ` samples a second of each subscription, then the bounds of the
-bus's inbox. What is left out is counted, and told to the receiver. A router tells nothing of what it has passed on: the
-link knows no stall, and its receiver has to watch for silence.
+bus's inbox. What is dropped is counted, and reported to the receiver. A router does not report what it has forwarded:
+the link detects no stall, and its receiver has to watch for silence.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from zbridge.transport.transferable import Parcel
 RATE_HZ = 2000.0
 """Samples a second of one subscription; more are dropped on Zenoh's own thread."""
 DECLARED = 256
-"""Keys that a link may have declared at a time."""
+"""Most keys that a link may have declared at a time."""
 LOOK_S = 0.5
 """Seconds between two reports: the time, and what was dropped."""
 
 
 class ZenohLink:
-    """One Zenoh session. Made by :func:`connect` and :func:`serve`; its receiver is told when the session ends."""
+    """One Zenoh session. Made by :func:`connect` and :func:`serve`; its receiver is notified when the session ends."""
 
     def __init__(self, peer: str, bus: Bus, metrics: Metrics, receiver: Receiver) -> None:
         self.peer = peer
@@ -72,7 +72,7 @@ class ZenohLink:
     unacknowledged_s = 0.0
 
     def write(self, data: bytes) -> None:
-        """Carry out one frame. Raises ProtocolError for one that cannot be, LinkError above :data:`DECLARED` keys."""
+        """Carry out one frame. Raises ProtocolError for one that is invalid, LinkError above :data:`DECLARED` keys."""
         if not self._open:
             return
         sample = read_sample(data)

@@ -1,4 +1,4 @@
-"""Whether a link takes what is written: it is stalled while bytes wait too long for their acknowledgement."""
+"""Whether a link is stalled: written bytes have waited too long for their acknowledgement."""
 
 from __future__ import annotations
 

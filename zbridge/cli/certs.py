@@ -86,7 +86,7 @@ def issue(
         raise ConfigError(f"--listeners: a gateway's; the role {role} has none")
     member = Member(role, tuple(robot or ()), listeners)
     issued = make(folder, CertificateRequest(name, member, tuple(host or ()), days), now(), force=force)
-    say_issued(folder, name, issued)
+    print_issued(folder, name, issued)
     if issued.replaced_until is not None:
         say(
             f"The certificate that it replaces is valid until {issued.replaced_until:%Y-%m-%d} all the same."
@@ -111,7 +111,7 @@ def renew(
     if bool(names) == every:
         raise ConfigError("name one NAME or more, or give --all")
     for name in names or load_roles(folder.roles).names:
-        say_issued(folder, name, authority.renew(folder, name, now(), days=days))
+        print_issued(folder, name, authority.renew(folder, name, now(), days=days))
     say("The key stays: carry the new certificate.pem and ca.pem to where the old ones are used, and restart there.")
 
 
@@ -195,7 +195,7 @@ def say(text: object) -> None:
     typer.echo(shown(text))
 
 
-def say_issued(folder: Folder, name: str, issued: Issued) -> None:
+def print_issued(folder: Folder, name: str, issued: Issued) -> None:
     """Print where a certificate is, and what it is."""
     say(f"{folder.of(name).folder}: {issued.common_name}, expires {issued.expires:%Y-%m-%d}, {issued.fingerprint}")
 

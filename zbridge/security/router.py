@@ -98,7 +98,7 @@ class ZenohWarnings:
         """By warning, when it was logged, and how often it came since."""
 
     def take(self, line: str) -> None:
-        level, text = in_our_words(line)
+        level, text = translate_log_line(line)
         if text not in self._logged and len(self._logged) >= KINDS:
             text = "more kinds of Zenoh warnings than are counted apart"
         at, more = self._logged.get(text, (-FOLD_S, 0))
@@ -110,7 +110,7 @@ class ZenohWarnings:
         log.log(level, "%s%s", text, f" ({more} times more since it was last logged)" if more else "")
 
 
-def in_our_words(line: str) -> tuple[int, str]:
+def translate_log_line(line: str) -> tuple[int, str]:
     """Return the level and the text of one line of Zenoh's log."""
     for pattern, text in _WORDS:
         if re.search(pattern, line):

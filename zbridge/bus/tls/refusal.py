@@ -1,8 +1,8 @@
-"""Why a router was not reached: a handshake of our own, after Zenoh's failed, says which case it is.
+"""Finds out why a router was not reached, by a handshake of our own after Zenoh's failed.
 
-Zenoh's client says "Unable to connect" whatever the cause. The handshake is made with the same files by Python's
-``ssl``, on a thread of its own, and takes :data:`LONGEST_S` at most. In TLS 1.3 a server refuses a client's certificate
-only after the handshake: so one read follows.
+Zenoh's client reports "Unable to connect" whatever the cause. Python's ``ssl`` makes the handshake with the same files,
+on a thread of its own, within :data:`LONGEST_S`. In TLS 1.3 a server rejects a client's certificate only after the
+handshake, so one read follows.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from zbridge.bus.tls.files import client_context, out_of_date, own_certificate, 
 from zbridge.errors import ConfigError
 
 LONGEST_S = 3.0
-"""Longest time that finding the cause takes."""
+"""Longest time to find the cause, seconds."""
 _HANDSHAKE_S = 1.8
-"""Longest time for the handshake; what is left is for telling who it is that answers no TLS."""
+"""Longest time for the handshake, seconds; the rest is for identifying a server that does not speak TLS."""
 _PLAIN_S = 0.5
-"""Longest time for a router of plain TCP to end a connection that says nonsense."""
+"""Longest time until a router of plain TCP closes a connection that sends garbage, seconds."""
 _MOST = 4
-"""Endpoints that are tried."""
+"""Most endpoints that are tried."""
 _NO_MESSAGE = b"\x16\x03\x03\x04\x00".ljust(2 + 0x0316, b"\xff")
-"""Over plain TCP a whole frame of Zenoh's (its length comes first, 0x0316) that is no message: it ends the connection.
-For TLS the beginning of a record of 0x0400 bytes: the rest is waited for."""
+"""In plain TCP a whole Zenoh frame (its length, 0x0316, comes first) that is no message: the router disconnects. In TLS
+the beginning of a record of 0x0400 bytes: the server waits for the rest."""
 
 
 class Finding(msgspec.Struct, frozen=True):
-    """Why a router was not reached. refused: trying again soon helps nobody; else the router may just be away."""
+    """Why a router was not reached. refused: retrying soon is useless; otherwise the router may just be away."""
 
     text: str
     refused: bool = True
@@ -45,7 +45,7 @@ class Finding(msgspec.Struct, frozen=True):
 async def why_not(settings: BusSettings, *, ask: bool = True) -> Finding | None:
     """Return why none of the endpoints could be connected to; None if nothing is found to be wrong.
 
-    ask: connect to them; else only our own files are looked at. A router pays for each connection that says nothing.
+    ask: connect to them; otherwise only our own files are checked. A silent connection costs a router time.
     """
     local = own_fault(settings.tls)
     if local is not None:
@@ -72,7 +72,7 @@ def own_fault(tls: Tls | None) -> str | None:
 
 
 def ask_endpoint(endpoint: str, tls: Tls | None) -> Finding | None:
-    """Return why this endpoint takes no connection, by connecting to it; None if it seems to."""
+    """Connect to an endpoint; return why it accepts no connection, None if it seems to."""
     kind, _, address = endpoint.partition("/")
     host, _, port = address.partition("#")[0].partition("?")[0].rpartition(":")
     if kind not in ("tcp", "tls") or not port.isdigit():
@@ -102,7 +102,7 @@ def ask_endpoint(endpoint: str, tls: Tls | None) -> Finding | None:
 def _shake_hands(
     link: socket.socket, at: str, host: str, tls: Tls | None, kind: str, deadline: float
 ) -> Finding | None:
-    """Shake hands, and hear what the router thinks of our certificate; None if no TLS came back."""
+    """Shake hands, and return why that failed or led nowhere; None if the endpoint does not answer in TLS."""
     if tls is not None:
         context, certificate = client_context(tls), own_certificate(tls)
     else:
@@ -189,14 +189,14 @@ _NO_TLS = ("WRONG_VERSION_NUMBER", "UNEXPECTED_EOF_WHILE_READING", "HTTP_REQUEST
 
 
 def _left(deadline: float) -> float:
-    """Return the seconds that are left, never none: a socket without a timeout waits for ever."""
+    """Return the seconds that are left, more than 0: a socket without a timeout waits forever."""
     return max(deadline - time.monotonic(), 0.05)
 
 
 async def _on_thread(
     work: Callable[[str, Tls | None], Finding | None], endpoint: str, tls: Tls | None
 ) -> Finding | None:
-    """Run what blocks on a thread that nobody waits for in the end; None if it takes too long, or fails itself."""
+    """Run a blocking call on a thread that may be abandoned; None if it takes too long, or fails itself."""
     loop = asyncio.get_running_loop()
     done: asyncio.Future[Finding | None] = loop.create_future()
 

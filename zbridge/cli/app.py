@@ -78,9 +78,9 @@ def run(
     verbose: Verbose = False,
     take_over: Annotated[int, typer.Option("--take-over", help="descriptor from the predecessor", hidden=True)] = -1,
 ) -> None:
-    """Run a gateway in the foreground until SIGTERM or SIGINT; of a directory or several files one process each.
+    """Run a gateway in the foreground until SIGTERM or SIGINT; for a directory or several files, one process per file.
 
-    SIGUSR2 restarts a gateway under way.
+    SIGUSR2 restarts a gateway without dropping its connections.
     """
     host = load_host(files[0]) if len(files) == 1 and files[0].is_dir() else HostSettings()
     if together or host.together:
@@ -209,7 +209,7 @@ def read_drive(text: str) -> tuple[float, float] | None:
 
 
 async def simulate_robot(simulated: Protocol, simulation: Simulation, camera: str) -> None:
-    """Simulate a robot, and its camera where an address is given, until cancelled."""
+    """Simulate a robot, and its camera if an address is given, until cancelled."""
     if not camera:
         await simulated.simulate(simulation)
         return
@@ -241,7 +241,7 @@ def probe(
     tls: TlsFolder = None,
     realm: Realm = "fleet",
 ) -> None:
-    """Print what a device is: from its gateway on the bus, else, with --yes, by a handshake with it."""
+    """Print what a device is: as its gateway reports on the bus, or, with --yes, after a handshake with it."""
     from zbridge.cli.probe import probe as ask
 
     found = find_protocol(protocol)
@@ -283,7 +283,7 @@ def router(
         bool, typer.Option("--print-nftables", help="print nftables rules that limit new connections per address")
     ] = False,
 ) -> None:
-    """Run a Zenoh router in the foreground until SIGTERM or SIGINT: with tls, each member may do what its role may."""
+    """Run a Zenoh router in the foreground until SIGTERM or SIGINT; with tls, roles limit what members may do."""
     from zbridge.cli.router import run_router
 
     set_up_log(verbose=False)

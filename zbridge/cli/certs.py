@@ -1,6 +1,6 @@
 """``zbridge certs``: an authority, and the certificates of everyone who may use a secure bus.
 
-What needs the package ``cryptography``, an extra, is imported by the command that uses it.
+Modules that need the package ``cryptography``, an extra, are imported by the commands that use them.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ Force = Annotated[bool, typer.Option("--force", help="replace what exists")]
 
 RESTART = "Restart the router, which reads roles.toml when it starts. That loses the bus: every driven robot stops."
 _PRINT = 8
-"""Bytes of a fingerprint in a table; all of them with --json."""
+"""Bytes of a fingerprint shown in the table; --json shows all."""
 _WIDTH = 180
-"""Characters of a line of the table, at least, also where the terminal has fewer."""
+"""Least width of the table, characters, also on narrower terminals."""
 
 
 @app.command()
@@ -135,7 +135,7 @@ def list_names(
 
 @app.command()
 def revoke(name: Name, directory: Directory = Path("certs")) -> None:
-    """Take a name out of roles.toml for good."""
+    """Remove a name from roles.toml for good."""
     folder = opened(directory)
     from zbridge.security.certs import authority
 
@@ -186,7 +186,7 @@ def opened(directory: Path, command: str = "zbridge certs") -> Folder:
 
 
 def now() -> datetime:
-    """Return the time, to the second: certificates count no finer."""
+    """Return the time, to the second, as certificates have it."""
     return datetime.now(UTC).replace(microsecond=0)
 
 

@@ -1,6 +1,6 @@
 """``zbridge demo``: a simulated robot of each protocol, their gateways, a router, a table. Loopback only.
 
-Here the bus is open to all of this machine, and its router embedded; ``demo_bus`` makes one with roles.
+Here the bus is open to this machine, and its router embedded; ``demo_bus`` makes a bus with roles.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ FIGURE: tuple[dict[str, float], ...] = ({"forward": 0.6}, {"turn": 0.5})
 FIGURE_S = 2.0
 """Seconds of each motion: the robots drive straight on, then turn, and so on."""
 PRIORITY = -1
-"""Below the default of 0: anybody else who asks for a robot gets it."""
+"""Below the default of 0: any other program that acquires a robot gets it."""
 _RATES = ("pose", "scan", "map", "sensor")
 _NO_DATA = (topics.STATUS.path, topics.CONTROL.path)
 
@@ -202,7 +202,7 @@ async def _robot(
 
 
 async def _show(fleet: Fleet, watch: LiveTable, seconds: float, how: list[str]) -> None:
-    """Say how to take part, draw the table, and drive each robot until somebody else does."""
+    """Print how to take part, draw the table, and drive each robot until somebody else does."""
     for line in how:
         print(line, flush=True)  # noqa: T201
     loop = asyncio.get_running_loop()
@@ -222,8 +222,8 @@ async def _show(fleet: Fleet, watch: LiveTable, seconds: float, how: list[str]) 
 async def wander(robot: Robot) -> None:
     """Drive straight on, turn, and so on, until somebody else takes the robot, or stops it.
 
-    If this program was paused meanwhile, the robot was stopped, and the program begins anew: with a neutral, or with a
-    new lease if the pause was longer than the lease. A robot that accepts no commands for now is waited for.
+    If this program was paused meanwhile, the robot was stopped, and the program starts over: with a neutral, or with a
+    new lease if the pause was longer than the lease. It waits for a robot that accepts no commands now.
     """
     with contextlib.suppress(Refused, BusError):
         while True:

@@ -19,7 +19,7 @@ from zbridge.fleet.printable import shown
 from zbridge.fleet.topics import KeySpace, is_name, split_key
 
 _NAMED = 20
-"""Robots of one finding that are named, at most."""
+"""Most robots that a finding names."""
 
 
 async def stop(settings: BusSettings, realm: str, robot: str | None, *, latch: bool, reason: str | None) -> bool:
@@ -45,7 +45,7 @@ async def unlatch(settings: BusSettings, realm: str, robot: str | None) -> bool:
 
 
 def _report(outcomes: Mapping[str, Outcome], done: str, realm: str, *, only: str | None = None) -> bool:
-    """Print what came of each robot, the reasons to stderr; return whether all is well."""
+    """Print the outcome for each robot, reasons to stderr; return whether all succeeded."""
     for error in outcomes.values():
         if error is not None:
             errors.print(shown(str(error)))

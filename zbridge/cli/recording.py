@@ -41,7 +41,7 @@ from zbridge.views.recording.tape import Tape, TapeSettings
 from zbridge.views.recording.wire_robot import WireLink
 
 _LOSSES = 20
-"""Keys with losses that are printed."""
+"""Most keys with losses that are printed."""
 _LEAST_BUFFER = 2**20
 _MARKS_NOT = ("viewer", "recorder")
 
@@ -148,7 +148,7 @@ def _report_end(recorder: Recorder, tape: Tape, seconds: float) -> None:
 
 
 async def put_mark(settings: BusSettings, realm: str, text: str, who: str | None) -> None:
-    """Put a mark on the bus; raise ConfigError for a role that may not: the router would drop it without a word."""
+    """Put a mark on the bus; raise ConfigError for a role that may not: the router would silently drop it."""
     if (role := own_role(settings.tls)) in _MARKS_NOT:
         raise ConfigError(f"a {role} may not mark: expected the certificate of an operator")
     async with joined(settings, realm) as bus:
@@ -256,7 +256,7 @@ async def run_replay(settings: BusSettings, options: ReplayOptions) -> None:
 
 @contextlib.contextmanager
 def _keys(player: Player) -> Iterator[None]:
-    """Let Enter pause and resume the player."""
+    """Make Enter pause and resume the player."""
     loop, stdin = asyncio.get_running_loop(), sys.stdin.fileno()
 
     def pressed() -> None:
@@ -281,7 +281,7 @@ def _keys(player: Player) -> Iterator[None]:
 
 
 async def run_wire(path: Path, protocol: str, listen: list[str], robots: list[str], speed: float, realm: str) -> None:
-    """Be the legacy robot until all was played, or a signal."""
+    """Act as the legacy robot until all is played, or a signal."""
     with prefixed("listen = ", LinkError):
         addresses = [Address.parse(text) for text in listen]
     found = find_protocol(protocol)
@@ -302,7 +302,7 @@ async def run_wire(path: Path, protocol: str, listen: list[str], robots: list[st
 
 
 def _links(protocol: Protocol, count: int, recorded: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of the links of a robot with so many; raise ConfigError if the recording has other ones."""
+    """Return the names of this many links of a robot; raise ConfigError if the recording has others."""
     names = {
         number: protocol.robot(protocol.options(), number, Metrics()).link_names
         for number in range(1, protocol.links + 1)

@@ -87,7 +87,7 @@ def info(
     file: Recorded,
     json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
 ) -> None:
-    """Return what a recording holds: robots, keys, counts, rates, gaps, and whether it was cut off."""
+    """Print what a recording holds: robots, keys, counts, rates, gaps, and whether it was cut off."""
     from zbridge.cli.recording import show_info
 
     show_info(file, as_json=json)

@@ -1,8 +1,8 @@
-"""Frames of a link that is a Zenoh session: what a session declares and puts there, and what comes of it. Sans-IO.
+"""Frames of a link that is a Zenoh session: what a session declares and puts there, and what it receives. Sans-IO.
 
-A protocol whose robots speak plain Zenoh says ``Protocol(keyed=True)``. Its sessions then write and read these frames
-where others write and read bytes; :mod:`zbridge.transport.samples` carries them out. Everything else stays as it is:
-outbox, limits, states, taps.
+A protocol whose robots speak plain Zenoh declares ``Protocol(keyed=True)``. Its sessions then write and read these
+frames where others write and read bytes; :mod:`zbridge.transport.samples` carries them out. Everything else stays as it
+is: outbox, limits, states, taps.
 
 =========== ==================================================== ==============================================
 written     SUBSCRIBE, WATCH and ANNOUNCE declare until the      ``key``: an expression; ANNOUNCE: a liveliness
@@ -33,7 +33,7 @@ SAMPLE_BYTES = 16 * 2**20
 
 
 class SampleKind(IntEnum):
-    """What a frame says."""
+    """The kind of a frame."""
 
     SUBSCRIBE = 1
     WATCH = 2
@@ -49,7 +49,7 @@ class SampleKind(IntEnum):
 
 
 class KeyedSample(msgspec.Struct, frozen=True):
-    """One frame. stamp_ns: when it came, Unix nanoseconds; of what is written 0."""
+    """One frame. stamp_ns: when it was received, Unix nanoseconds; 0 in written frames."""
 
     kind: SampleKind
     key: str = ""
@@ -59,7 +59,7 @@ class KeyedSample(msgspec.Struct, frozen=True):
 
     @property
     def count(self) -> int:
-        """The number of samples that DROPPED tells of; raises ProtocolError if it tells none."""
+        """The number of samples that DROPPED reports; raises ProtocolError if it has none."""
         if len(self.payload) != _COUNT.size:
             raise ProtocolError(f"DROPPED of {len(self.payload)} bytes: expected {_COUNT.size}")
         return int(_COUNT.unpack(self.payload)[0])
@@ -76,7 +76,7 @@ def dropped(count: int) -> KeyedSample:
 
 
 def write_sample(sample: KeyedSample) -> bytes:
-    """Write a frame; raise EncodeError where key, attachment or payload is too long."""
+    """Write a frame; raise EncodeError if key, attachment or payload is too long."""
     key, attachment = sample.key.encode(), sample.attachment
     shown = attachment or b""
     size = _HEADER.size + len(key) + len(shown) + len(sample.payload)

@@ -42,7 +42,7 @@ from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.protocol.kept import Exported
 from zbridge.protocol.session_table import SessionTable
-from zbridge.robot.device import Device
+from zbridge.robot.device import RobotDevice
 from zbridge.robot.observer import Observer
 from zbridge.robot.ownership import Ownership
 from zbridge.robot.settings import DevicePlan
@@ -256,7 +256,7 @@ class Gateway:
         return bus.answer(self._keys.key(topics.RPC_SESSIONS(who).path), answer)
 
     async def _serve(
-        self, bus: Bus, ownership: Ownership, device: Device, store: LatchStore, begin: Begin | None = None
+        self, bus: Bus, ownership: Ownership, device: RobotDevice, store: LatchStore, begin: Begin | None = None
     ) -> None:
         """Serve the robot, and its camera, until another gateway takes it over."""
         self.restarts.device, camera = device, None
@@ -276,11 +276,11 @@ class Gateway:
         finally:
             self.restarts.device = self._serving = None
 
-    def _make_device(self, bus: Bus, audit: Audit, plan: DevicePlan, store: LatchStore) -> Device:
+    def _make_device(self, bus: Bus, audit: Audit, plan: DevicePlan, store: LatchStore) -> RobotDevice:
         near, runtime = self._neighbourhood, self._runtime
         control = self._plan.config.control
         limited = control.rate_hz is not None or control.slew_per_s is not None
-        return Device(
+        return RobotDevice(
             plan.make_robot(self.metrics),
             plan.addresses,
             protocol=plan.protocol.name,

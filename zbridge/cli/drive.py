@@ -29,7 +29,7 @@ _HELP = """hold a key down to move, release it to stop
   space  STOP (whoever drives)       + -  speed                Enter  take the lease again     x  end"""
 
 
-class Session:
+class DriveRun:
     """One run of ``zbridge drive``: keys in, drives out, one line of state on the terminal."""
 
     def __init__(self, robot: Robot, speed: float, *, who: str | None, takeover: bool) -> None:
@@ -125,7 +125,7 @@ async def drive_robot(
     if not sys.stdin.isatty():
         raise ZbridgeError("drive needs a terminal to read keys from")
     async with connect(settings=settings, realm=realm) as fleet:
-        await Session(fleet[name], speed, who=who, takeover=takeover).run()
+        await DriveRun(fleet[name], speed, who=who, takeover=takeover).run()
     print()  # noqa: T201
 
 

@@ -67,7 +67,7 @@ _LOOK_S = 0.005
 """Seconds between two looks whether the links can be handed over."""
 
 
-class Device(Transferable):
+class RobotDevice(Transferable):
     """One robot on the bus; ``run`` serves it. addresses: one for each of the robot's links."""
 
     def __init__(
@@ -170,7 +170,7 @@ class Device(Transferable):
         )
 
     def __repr__(self) -> str:
-        return f"<Device {self._context.keys.robot} {self._links.first.state}>"
+        return f"<RobotDevice {self._context.keys.robot} {self._links.first.state}>"
 
     async def run(self, begin: Callable[[], Awaitable[None]] | None = None) -> None:
         """Serve the robot until cancelled; then stop it if it moves, and take leave of it.

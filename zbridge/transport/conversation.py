@@ -24,7 +24,7 @@ from zbridge.protocol.kept import Budget, Exported
 from zbridge.protocol.session import Datagram, Session, State
 from zbridge.transport.fair_share import FairShare
 from zbridge.transport.link import Link
-from zbridge.transport.reading import Reading
+from zbridge.transport.reading import ReadControl
 from zbridge.transport.stalls import Stalls
 from zbridge.transport.transferable import Parcel
 
@@ -115,7 +115,7 @@ class Conversation:
         self._malformed_logged = 0
         self._surplus = surplus or Count()
         self._stalls = Stalls(self._clock, stalled)
-        self._reading = Reading(loop, self._clock, share)
+        self._reading = ReadControl(loop, self._clock, share)
         self.connected_at: float | None = None
         """When the link came up, also in the process that had it before; None if it was never up."""
         self._heard_at = -math.inf

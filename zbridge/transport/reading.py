@@ -9,7 +9,7 @@ from zbridge.transport.fair_share import FairShare
 from zbridge.transport.link import Link
 
 
-class Reading:
+class ReadControl:
     """Pauses and resumes the reading of one link.
 
     ``share``: of a processor; None: unlimited. ``clock``: seconds on the loop's time line.
@@ -28,7 +28,7 @@ class Reading:
         self._rests: asyncio.TimerHandle | None = None
 
     def __repr__(self) -> str:
-        return f"<Reading {'paused' if self._paused else 'rests' if self.rests else 'on'}>"
+        return f"<ReadControl {'paused' if self._paused else 'rests' if self.rests else 'on'}>"
 
     @property
     def rests(self) -> bool:

@@ -24,7 +24,7 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Query
 from zbridge.fleet.topics import KeySpace
 from zbridge.protocol.kept import Budget, Exported
-from zbridge.robot.device import Device
+from zbridge.robot.device import RobotDevice
 from zbridge.robot.ownership import Ownership
 from zbridge.transport import Parcel, Transferable
 from zbridge.transport.kernel import KERNEL, Kernel
@@ -94,7 +94,7 @@ class Restarts:
         self._processes = processes
         self._kernel = kernel
         self.listeners: Sequence[Transferable] = ()
-        self.device: Device | None = None
+        self.device: RobotDevice | None = None
         self.claim: ClaimPart | None = None
         self.metrics_sockets: list[socket.socket] = []
         self.gone = asyncio.Event()

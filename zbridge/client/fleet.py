@@ -52,8 +52,8 @@ SETTLE_S = 3.0
 ANSWER_S = 5.0
 """Longest wait for a robot's answer, seconds."""
 _attempts = itertools.count(1)
-"""Numbers the requests for a lease. Each has its own liveliness token: a gateway may learn that an earlier one's token is
-gone only after it has granted a later request, whose lease must not end for that."""
+"""Numbers the requests for a lease. Each has its own liveliness token: a gateway may learn that an earlier one's token
+is gone only after it has granted a later request, whose lease must not end for that."""
 
 
 class Fleet:

@@ -315,7 +315,7 @@ class Conversation:
         link = self._link
         if link is None or self.session.over:
             return "the connection is not up"
-        return link.blocker or (None if link.ready else "the peer takes nothing")
+        return link.blocker or (None if link.ready else "the peer is stalled")
 
     def suspend(self) -> None:
         """Read and write nothing, and run no timer, until :meth:`resume`."""

@@ -1,7 +1,7 @@
 """One viewer: reads its messages, asks the source to carry them out, and sends what waits for it.
 
 A message that cannot be read or carried out is counted, and the person is told why; it ends nothing. A viewer that
-sends more than ``RATE_HZ`` a second, or too many queued answers, is closed. Knows no bus and no file.
+sends more than ``RATE_HZ`` a second, or lets too many answers queue up, is closed. Knows no bus and no file.
 """
 
 from __future__ import annotations

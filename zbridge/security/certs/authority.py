@@ -83,7 +83,7 @@ class Issued(msgspec.Struct, frozen=True):
 
 
 class Revoked(msgspec.Struct, frozen=True):
-    """A revoked name. until: when its certificate expires, if there is one. server: its certificate is a server's too."""
+    """A revoked name. until: when its certificate expires, if any. server: its certificate is a server's too."""
 
     common_name: str
     until: datetime | None

@@ -102,13 +102,13 @@ class Enforcer:
             self._stale.value += 1
             raise Stale("the command is too old: the network delayed it")
 
-    def require_motion(self) -> None:
+    def check_motion(self) -> None:
         """Raise Refused if the holder must send neutral before the robot moves."""
-        self.authority.require_motion()
+        self.authority.check_motion()
 
     def permit(self, command: Drive | Motor, now: float) -> Drive | Motor:
         """Return the motion that the robot may be sent, within the limits; raise Refused if it may not move."""
-        self.authority.require_motion()
+        self.authority.check_motion()
         if self._limits is None or not isinstance(command, Drive):
             return command
         limited = self._limits.limit(command, now)
@@ -122,7 +122,7 @@ class Enforcer:
         """
         authority = self.authority
         if moving:
-            authority.require_motion()
+            authority.check_motion()
         whole = isinstance(command, Drive)
         authority.applied(path, sender.given_at, moving=moving, stale=sender.stale, whole=whole)
         if isinstance(command, Drive):

@@ -149,7 +149,7 @@ class Commands:
         if sender is not None and (isinstance(command, Raw) or _is_autonomous(command)):
             self._enforcer.require_fresh(sender)
             _require_sure(session)
-            self._enforcer.require_motion()
+            self._enforcer.check_motion()
 
     def _command(self, topic: Topic, command: FleetMessage, now: float, sender: CommandSender | None) -> None:
         self._show(topic, self._tell(topic, command, now), sender)

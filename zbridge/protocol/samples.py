@@ -82,21 +82,21 @@ def write_sample(sample: KeyedSample) -> bytes:
     size = _HEADER.size + len(key) + len(shown) + len(sample.payload)
     if len(key) >= _NONE or len(shown) >= _NONE or size > SAMPLE_BYTES:
         raise EncodeError(f"{sample.key[:80]}: sample of {size} bytes, attachment of {len(shown)}")
-    told = _NONE if attachment is None else len(shown)
-    return b"".join((_HEADER.pack(size, sample.kind, len(key), told, sample.stamp_ns), key, shown, sample.payload))
+    extra = _NONE if attachment is None else len(shown)
+    return b"".join((_HEADER.pack(size, sample.kind, len(key), extra, sample.stamp_ns), key, shown, sample.payload))
 
 
 def read_sample(frame: bytes) -> KeyedSample:
     """Read a frame; raise ProtocolError if it is none."""
     if sample_end(frame, 0) != len(frame):
         raise ProtocolError(f"sample of {len(frame)} bytes is cut off")
-    _, kind, key_bytes, told, stamp_ns = _HEADER.unpack_from(frame)
+    _, kind, key_bytes, extra, stamp_ns = _HEADER.unpack_from(frame)
     shown_at = _HEADER.size + key_bytes
-    payload_at = shown_at + (0 if told == _NONE else told)
+    payload_at = shown_at + (0 if extra == _NONE else extra)
     try:
         key = frame[_HEADER.size : shown_at].decode()
         return KeyedSample(
-            SampleKind(kind), key, frame[payload_at:], None if told == _NONE else frame[shown_at:payload_at], stamp_ns
+            SampleKind(kind), key, frame[payload_at:], None if extra == _NONE else frame[shown_at:payload_at], stamp_ns
         )
     except ValueError as error:
         raise ProtocolError(f"sample of {len(frame)} bytes: {error}") from error
@@ -106,7 +106,7 @@ def sample_end(data: bytes, start: int) -> int:
     """Find the end of the frame at ``start``; the framing function of these sessions."""
     if len(data) - start < _HEADER.size:
         return start + _HEADER.size
-    size, _, key_bytes, told, _ = _HEADER.unpack_from(data, start)
-    if size < _HEADER.size + key_bytes + (0 if told == _NONE else told):
+    size, _, key_bytes, extra, _ = _HEADER.unpack_from(data, start)
+    if size < _HEADER.size + key_bytes + (0 if extra == _NONE else extra):
         raise ProtocolError(f"sample of {size} bytes with a key of {key_bytes}")
     return start + int(size)

@@ -65,18 +65,18 @@ class PollingReader:
 
     def poll(self) -> bytes | None:
         """Read without waiting: None if nothing is there, empty at the end of the stream; raise OSError."""
-        looked_at, data = time.monotonic(), None
+        polled_at, data = time.monotonic(), None
         with contextlib.suppress(BlockingIOError):
             data = self._tcp.recv(self._most_bytes)
             self.unread_s = time.monotonic() - self._empty_at
         if data is None or len(data) < self._most_bytes:
-            self._empty_at = looked_at
+            self._empty_at = polled_at
         return data
 
-    async def read(self, look_s: float) -> bytes:
-        """Read as soon as there is data; poll every ``look_s``, to know since when there was none."""
+    async def read(self, poll_s: float) -> bytes:
+        """Read as soon as there is data; poll every ``poll_s``, to know since when there was none."""
         while (data := self.poll()) is None:
-            await readable(self._tcp, look_s)
+            await readable(self._tcp, poll_s)
         return data
 
 

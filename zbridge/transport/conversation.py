@@ -227,7 +227,7 @@ class Conversation:
             link.drop_source()
         established = session.state is _ESTABLISHED
         writing = link is not None and (
-            (not established and session.over) or self._stalls.takes(link)
+            (not established and session.over) or self._stalls.accepts(link)
         )  # the last frames leave
         now = self._clock()
         while writing and link is not None and link.ready and (not established or outbox.due(now)):

@@ -29,7 +29,7 @@ RATE_HZ = 2000.0
 """Samples a second of one subscription; more are dropped on Zenoh's own thread."""
 DECLARED = 256
 """Most keys that a link may have declared at a time."""
-LOOK_S = 0.5
+REPORT_S = 0.5
 """Seconds between two reports: the time, and what was dropped."""
 
 
@@ -48,7 +48,7 @@ class ZenohLink:
         self._publishers: dict[str, Publisher] = {}
         self._above = 0
         """Samples that came too fast."""
-        self._told = 0
+        self._reported = 0
         self._looking: dict[str, asyncio.Task[None]] = {}
         self._closing: asyncio.Task[bool] | None = None
         self._timer: asyncio.TimerHandle | None = None
@@ -96,7 +96,7 @@ class ZenohLink:
         """Do nothing: there is no source of datagrams."""
 
     def pause_reading(self) -> None:
-        """Drop and count what comes, until :meth:`resume_reading`: Zenoh cannot be told to wait."""
+        """Drop and count what comes, until :meth:`resume_reading`: Zenoh cannot be asked to wait."""
         self._paused = True
 
     def resume_reading(self) -> None:
@@ -207,10 +207,10 @@ class ZenohLink:
         """Tell the time, and what was dropped since."""
         if not self._open:
             return
-        self._timer = self._loop.call_later(LOOK_S, self._report)
+        self._timer = self._loop.call_later(REPORT_S, self._report)
         lost = self._above + self._metrics.total("bus_in_dropped")
-        if lost > self._told:
-            count, self._told = lost - self._told, lost
+        if lost > self._reported:
+            count, self._reported = lost - self._reported, lost
             self._feed(dropped(count))
         self._feed(KeyedSample(SampleKind.OPENED, payload=self._bus.zid.encode(), stamp_ns=time.time_ns()))
 

@@ -87,7 +87,7 @@ class Outgoing:
         except OSError as error:
             log.error("not restarted: %s", error)
             raise NotReady(f"not restarted: {error}") from error
-        changed = looked_after = False
+        changed = supervised = False
         try:
             with far:
                 await self._successor.start_successor(far)
@@ -100,8 +100,8 @@ class Outgoing:
             for part in self._parts:
                 await part.withdraw()
             self._require_no_end()
-            looked_after = self._successor.handed_over()
-            if not looked_after:
+            supervised = self._successor.handed_over()
+            if not supervised:
                 await channel.send(Go())
         except (HandoverError, Refused, BusError, OSError) as error:
             await self._take_back(channel, str(error), changed=changed)
@@ -110,7 +110,7 @@ class Outgoing:
             await asyncio.shield(self._take_back(channel, "the gateway ends", changed=changed))
             raise
         detached = asyncio.gather(*(part.detach() for part in self._parts))
-        if looked_after:
+        if supervised:
             await asyncio.sleep(0)  # detach the robot at once: the end of this process must not stop it
             with contextlib.suppress(HandoverError):
                 await channel.send(Go())

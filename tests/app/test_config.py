@@ -242,7 +242,7 @@ NOT_NAMES = ("a/b", "", "@r", "*")
 ERRORS: list[tuple[dict[str, Any], str]] = [
     # What is missing, unknown, or of another type, at every depth
     ({}, "robot: missing"),
-    ({"robot": {"name": "r1"}}, "device: missing, it is required where there is no [[hq]]"),
+    ({"robot": {"name": "r1"}}, "device: missing, it is required without [[hq]]"),
     (serving(hq(), {"protocol": "alf"}), "hq[1].listen: missing, it is required"),
     (minimal(bus={"tls": {}}), "bus.tls.ca: missing"),
     # On a secure bus every program is a client of a router

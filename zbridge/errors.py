@@ -31,7 +31,7 @@ FAULT = "a fault of the protocol: "
 
 
 def describe(error: BaseException) -> str:
-    """Say what was raised, and where: ``KeyError: 1 in HqRole.decode (session.py:36)``."""
+    """Return what was raised, and where: ``KeyError: 1 in HqRole.decode (session.py:36)``."""
     where = ""
     for frame, line in traceback.walk_tb(error.__traceback__):
         code = frame.f_code
@@ -122,7 +122,7 @@ class NeutralFirst(Refused):
 
 
 class Stale(Refused):
-    """The command was given too long ago: the network held it up."""
+    """The command is too old on arrival: the network delayed it."""
 
     codes = (Code.STALE,)
 

@@ -212,7 +212,7 @@ class AlfHq(HqSide):
     # What is understood
 
     def is_motion(self, command: Drive | Motor) -> bool:
-        """Tell whether a command moves the robot: a turn without speed only sets the wheels, and so is neutral."""
+        """Return whether a command moves the robot: a turn without speed only sets the wheels, and so is neutral."""
         return command.moving and not (isinstance(command, Drive) and not command.forward and not command.left)
 
     def take(self, session: AlfClient, message: messages.AlfMessage) -> tuple[Telemetry, ...]:

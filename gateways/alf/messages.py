@@ -185,7 +185,7 @@ _TERMINATOR = b";"
 
 
 def text_limit(points: int) -> int:
-    """Give the length of the longest text message that is accepted, bytes."""
+    """Return the length of the longest text message that is accepted, bytes."""
     return (points + _FIXED_FIELDS) * _FIELD_BYTES
 
 
@@ -230,7 +230,7 @@ def _known(number: bytes, ids: frozenset[int]) -> AlfSpec:
 
 
 def binary_size(message_id: int, points: int) -> int:
-    """Give the length of a binary message with its id, bytes."""
+    """Return the length of a binary message with its id, bytes."""
     size = 1 + MESSAGES[message_id].binary.fixed_size
     return size + POINT_BYTES * points if message_id == Measurement.spec.id else size
 

@@ -96,7 +96,7 @@ class Car:
         return Measurement(self._sequence, self._clock_ms, np.maximum(points, 0), FIRST_VALID, LAST_VALID)
 
     def info(self) -> DriveInfo:
-        """Give how it moves, in the units of its dialect."""
+        """Return how it moves, in the units of its dialect."""
         g, degrees = STANDARD_GRAVITY, math.degrees(self._turn_rad_s)
         lateral = -self.speed_m_s * self._turn_rad_s / g
         values = (self._acceleration / g, lateral, 1.0, 0.0, 0.0, degrees)

@@ -227,7 +227,7 @@ class AlfRobot(RobotSide):
 
 
 def ranges_m(message: messages.Measurement, scanner: messages.ScannerInit) -> Floats:
-    """Give the ranges, metres, float32[n]: NaN outside the valid indices (inclusive) and outside the range."""
+    """Return the ranges, metres, float32[n]: NaN outside the valid indices (inclusive) and outside the range."""
     least, most = max(1, scanner.range_min_mm), max(0, scanner.range_max_mm)
     if most <= _MOST_TABLE_MM:
         ranges: Floats = _metres(least, most).take(message.points, mode="clip")

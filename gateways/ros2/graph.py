@@ -111,7 +111,7 @@ class Graph:
 
     @property
     def waiting_for(self) -> str:
-        """Say why nothing of the robot is known."""
+        """Return why nothing of the robot is known."""
         if self.publishers:
             return "its publishers are silent"
         if self.wrong:
@@ -120,7 +120,7 @@ class Graph:
 
     @property
     def drive_problem(self) -> str | None:
-        """Say why the robot cannot be driven; None if it can."""
+        """Return why the robot cannot be driven; None if it can."""
         if self.subscribers:
             return None
         if self.command_topic is None:

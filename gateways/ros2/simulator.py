@@ -215,7 +215,7 @@ class RosMachine:
         )
 
     def map(self, header: Any) -> Any:
-        """Give the map of what was seen so far."""
+        """Return the map of what was seen so far."""
         make = self._types.message
         percents = np.array([-1, 0, 100], np.int8)[self.grid.cells.T]
         corner = make("geometry_msgs/msg/Point", x=-CELLS * CELL_M / 2, y=-CELLS * CELL_M / 2)

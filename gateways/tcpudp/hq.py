@@ -63,7 +63,7 @@ class TcpUdpHq(HqSide):
         return ClientIds(CLIENTS, self.options.quiet_s)
 
     def initial_commands(self) -> tuple[Telemetry, ...]:
-        """Give mode none: a client drives only after it has sent control mode 2 or 3."""
+        """Return mode none: a client drives only after it has sent control mode 2 or 3."""
         return ((topics.CMD_MODE, Mode("none")),)
 
     def session(self, number: int, bounds: Limits) -> TcpUdpClient:
@@ -145,7 +145,7 @@ _SIZES = ("1.3", "1.4")
 
 @cache
 def no_map() -> Map:
-    """Give the map of a robot that has none."""
+    """Return the map of a robot that has none."""
     import numpy as np
 
     return Map(0, 0, 1.0, (0.0, 0.0), np.zeros((0, 0), np.uint8))

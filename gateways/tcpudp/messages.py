@@ -308,7 +308,7 @@ def decode_packet(frame: bytes) -> Packet:
 
 
 def decoder(packet_id: int) -> Callable[[bytes, int], Packet]:
-    """Give the function that reads the body of a packet, ``decode(frame, start of the body)``."""
+    """Return the function that reads the body of a packet, ``decode(frame, start of the body)``."""
     spec = PACKETS.get(packet_id)
     if spec is None:
         return lambda frame, start: OpaquePacket(packet_id, frame[start:])
@@ -323,7 +323,7 @@ def _decode_text(frame: bytes, start: int) -> Packet:
 
 
 def _is_whole_text(frame: bytes, start: int) -> bool:
-    """Tell whether a body is itself a packet 1 from the robot, down to its last byte."""
+    """Return whether a body is itself a packet 1 from the robot, down to its last byte."""
     size = len(frame) - start
     if size < HEADER.size + 4:
         return False

@@ -46,7 +46,7 @@ PARTS = 4
 
 
 def settings_of(version: str, *, udp: bool) -> Settings:
-    """Give what a simulated robot of a version announces: every flag its version has."""
+    """Return what a simulated robot of a version announces: every flag its version has."""
     block = ROBOT_BLOCKS.get(version, RobotSettings13)
     flags: dict[str, int] = {feature.value: True for feature in Feature if hasattr(block, feature.value)}
     if block is RobotSettings13:
@@ -88,12 +88,12 @@ class Vehicle:
         self.grid.see(self.body.x, self.body.y, angles, ranges + noise * (ranges < LIDAR_RANGE_M), LIDAR_RANGE_M)
 
     def position(self) -> packets.ServerPosition:
-        """Give its place: x, y in its unit, heading in degrees with 0 along y."""
+        """Return its place: x, y in its unit, heading in degrees with 0 along y."""
         heading_deg = math.degrees(self.body.heading - math.pi / 2)
         return packets.ServerPosition(self.body.x / UNIT_M, self.body.y / UNIT_M, heading_deg)
 
     def map(self) -> packets.ServerSLAMMap:
-        """Give the map, x-major."""
+        """Return the map, x-major."""
         return packets.ServerSLAMMap(self.grid.cells.tobytes())
 
     def take(self, message: packets.Packet) -> tuple[packets.Packet, ...]:

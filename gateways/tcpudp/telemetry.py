@@ -54,11 +54,11 @@ class TelemetryTranslator(Kept):
         self._parts = None
 
     def translator(self, kind: type) -> Translate:
-        """Give the function that translates packets of one class."""
+        """Return the function that translates packets of one class."""
         return partial(_TELEMETRY.get(kind, TelemetryTranslator._raw), self)
 
     def known_map(self) -> FleetMessage | None:
-        """Give the map of the parts that came on this connection, None if none came; later cells replace older ones."""
+        """Return the map of the parts received on this connection, None if there is none; later cells win."""
         if self._parts is None:
             return None
         ((_, shown),) = self._map(packets.ServerSLAMMap(bytes(self._parts)), self._parts_ns)
@@ -145,7 +145,7 @@ class TelemetryTranslator(Kept):
 
 
 def announced_side(settings: Settings | None) -> int:
-    """Give the cells along a side of the map as the robot announces them; 0 for none or an absurd number."""
+    """Return the cells along a side of the map as the robot announces them; 0 for none or an absurd number."""
     if not isinstance(settings, RobotSettings13) or settings.slam_map_interval <= 0:
         return 0
     side = settings.slam_map_size // settings.slam_map_interval

@@ -80,7 +80,7 @@ class RegisteredDevices(Kept):
         return [device for device in self._by_number.values() if device.kind == kind]
 
     def message(self, stamp_ns: int) -> Devices:
-        """Give the table as a fleet message."""
+        """Return the table as a fleet message."""
         entries = (Device(device.shown, device.number, device.kind) for device in self._by_number.values())
         return Devices(tuple(entries), stamp_ns=stamp_ns)
 
@@ -98,7 +98,7 @@ def unnamed(number: int, kind_byte: int, kind: str) -> WebotsDevice:
 
 
 def kind_of(kind_byte: int, motor_types: dict[str, tuple[int, ...]]) -> str:
-    """Give the kind that a type byte means; motor types come first."""
+    """Return the kind that a type byte means; motor types come first."""
     for kind, types in motor_types.items():
         if kind_byte in types:
             return kind

@@ -46,7 +46,7 @@ STOP_REPEAT_S = 0.1
 
 
 def _interpolation(table: tuple[tuple[float, float], ...]) -> Callable[[float], float]:
-    """Give the function that a table of pairs means: linear between them, constant beyond."""
+    """Return the function that a table of pairs means: linear between them, constant beyond."""
     import numpy as np
 
     measured, meant = np.array(table).T
@@ -207,7 +207,7 @@ class Wc2EcRobot(RobotSide):
         return Outcome(left_out=f"{' and '.join(left_out)}: this robot has none" if left_out else None)
 
     def _velocities(self, command: Drive) -> dict[str, float]:
-        """Give the velocity of every driven motor, rad/s."""
+        """Return the velocity of every driven motor, rad/s."""
         wheels = self.options.differential
         if wheels is not None:
             left, right = (side_m_s / wheels.wheel_radius_m for side_m_s in wheels.sides_m_s(command))

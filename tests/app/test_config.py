@@ -242,7 +242,7 @@ NOT_NAMES = ("a/b", "", "@r", "*")
 ERRORS: list[tuple[dict[str, Any], str]] = [
     # What is missing, unknown, or of another type, at every depth
     ({}, "robot: missing"),
-    ({"robot": {"name": "r1"}}, "device: missing, it is required where there is no [[hq]]"),
+    ({"robot": {"name": "r1"}}, "device: missing, it is required without [[hq]]"),
     (serving(hq(), {"protocol": "alf"}), "hq[1].listen: missing, it is required"),
     (minimal(bus={"tls": {}}), "bus.tls.ca: missing"),
     # On a secure bus every program is a client of a router
@@ -289,12 +289,12 @@ ERRORS: list[tuple[dict[str, Any], str]] = [
     (serving(hq(listen="tls://a:1", tls={"key": "k"})), "hq[0].tls.certificate: missing"),
     (
         serving(hq(tls=TLS)),
-        "hq[0].listen = 'tcp://127.0.0.1:11002': expected tls://host:port, for there is a table tls",
+        "hq[0].listen = 'tcp://127.0.0.1:11002': expected tls://host:port, because there is a table tls",
     ),
     (serving(hq(listen="tls://a:1", tls=TLS)), "hq[0].tls: certificate '/none.pem' with key '/key.pem': No such file"),
     (serving(hq(), hq(listen="tls://127.0.0.1:11002", tls=TLS)), "hq[1].tls: certificate '/none.pem'"),
     # The camera
-    ({**serving(hq()), "camera": {"url": URL}}, "camera: expected only where there is a table device"),
+    ({**serving(hq()), "camera": {"url": URL}}, "camera: expected only with a table device"),
     (minimal(camera={}), "camera.url: missing, it is required"),
     (minimal(camera={"url": URL, "rate": 5}), "camera.rate = 5: unknown key; expected one of url, rate_hz, stall_s,"),
     *[

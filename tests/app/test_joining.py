@@ -45,7 +45,7 @@ async def test_a_session_that_stays_away_where_a_second_one_connects_is_useless(
     scene.bus.connection(False)
     await asyncio.sleep(STUCK_S + RECONNECTS_S - 1.0)
     assert (scene.tried, scene.watching.done()) == (1, False)
-    with pytest.raises(SessionUseless, match="does not connect again, and a new one does"):
+    with pytest.raises(SessionUseless, match="does not reconnect, but a new one connects"):
         await asyncio.wait_for(scene.watching, 2.0)
 
 
@@ -92,7 +92,7 @@ async def test_a_gateway_leaves_a_useless_session_and_serves_on_a_new_one(
     with caplog.at_level(logging.ERROR):
         await asyncio.sleep(STUCK_S + RECONNECTS_S + 2.0)
     assert len(buses) == joined
-    assert sum("the bus is joined anew" in message for message in caplog.messages) == joined - 1
+    assert sum("joining the bus anew" in message for message in caplog.messages) == joined - 1
     assert await buses[-1].alive("fleet/r1/@alive/gateway") == ["fleet/r1/@alive/gateway"]
     running.cancel()
     await asyncio.wait([running])

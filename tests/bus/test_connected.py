@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from zbridge.bus.zenoh.connected import LOOK_AGAIN_S, ConnectedWatch
+from zbridge.bus.zenoh.connected import POLL_S, ConnectedWatch
 
 pytestmark = pytest.mark.jumping
 
@@ -55,7 +55,7 @@ async def test_the_last_word_is_what_is_true(
     for kind, zid in events:
         info.event(kind, zid)
     info.zids = [*list_later]
-    await asyncio.sleep(2 * max(LOOK_AGAIN_S))
+    await asyncio.sleep(2 * max(POLL_S))
     assert heard == told
 
 
@@ -81,5 +81,5 @@ async def test_who_closed_the_watch_hears_no_more() -> None:
     await asyncio.sleep(0)
     info.event(GONE, "a")
     watch.close()
-    await asyncio.sleep(2 * max(LOOK_AGAIN_S))
+    await asyncio.sleep(2 * max(POLL_S))
     assert heard == [True]

@@ -107,7 +107,7 @@ async def test_flush_waits_for_what_was_given_to_be_published_but_not_for_ever(b
     bus.publisher("fleet/r1/@cmd/mode", topics.CMD_MODE).put(b"mode")
     with monkeypatch.context() as patch:
         patch.setattr(session, "FLUSH_S", 0.01)
-        with pytest.raises(BusError, match=r"the bus took nothing for 0\.01 s"):
+        with pytest.raises(BusError, match=r"the bus accepted nothing for 0\.01 s"):
             await bus.flush()
     flushed = asyncio.ensure_future(bus.flush())
     await asyncio.to_thread(lambda: None)
@@ -155,7 +155,7 @@ def test_a_callback_that_never_ends_is_given_up_and_said_so_and_other_errors_are
     for thread in threading.enumerate():
         if thread.name == "zbridge-undeclare":
             thread.join(SOON_S)
-    assert "not taken back: Already borrowed" in caplog.text
+    assert "could not be undeclared: Already borrowed" in caplog.text
     with pytest.raises(RuntimeError, match="no such thing"):
         declared.Declared(Busy(math.inf, "no such thing")).close()
 

@@ -52,7 +52,7 @@ def terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
 
 
 def test_a_lab_is_set_up_listed_and_packed(terminal: Terminal) -> None:
-    assert "Keep certs/ca-key.pem to yourself" in terminal.types("init")
+    assert "Keep certs/ca-key.pem secret" in terminal.types("init")
     made = terminal.types("issue", "hub", "--role", "router", "--host", "hub.lab", "--host", "127.0.0.1")
     assert made.startswith("certs/hub: router.hub, expires 2031-01-31, ")
     assert made.endswith(RESTART)
@@ -93,7 +93,7 @@ def test_revoking_says_what_it_does_not_do(terminal: Terminal) -> None:
     terminal.types("issue", "hub", "--role", "router", "--host", "localhost")
     said = terminal.types("revoke", "ann")
     assert said.startswith(
-        "viewer.ann is revoked. ann is never issued again.\nIts certificate is valid until 2031-01-31: "
+        "viewer.ann is revoked, and ann cannot be issued again.\nIts certificate is valid until 2031-01-31: "
     )
     assert "Zenoh has no revocation lists" in said
     assert "pose as a router" not in said

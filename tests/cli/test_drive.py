@@ -11,7 +11,7 @@ import pytest
 
 from tests.client import World
 from zbridge.cli import drive
-from zbridge.cli.drive import Session
+from zbridge.cli.drive import DriveRun
 from zbridge.errors import Held
 from zbridge.fleet.messages import Drive
 
@@ -24,7 +24,7 @@ class Scene:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(drive, "_raw_keys", self.raw_keys)
         self.world = World()
-        self.session = Session(self.world.robot, 0.5, who="ann", takeover=False)
+        self.session = DriveRun(self.world.robot, 0.5, who="ann", takeover=False)
         self.running = asyncio.ensure_future(self.session.run())
 
     def raw_keys(self, loop: asyncio.AbstractEventLoop, take: Callable[[str], None]) -> Any:

@@ -22,7 +22,7 @@ from zbridge.bus import Answer, Bus, Sample
 from zbridge.bus.fake import FakeBus
 from zbridge.cli import LineFormatter
 from zbridge.cli.demo import LiveTable
-from zbridge.cli.drive import Session
+from zbridge.cli.drive import DriveRun
 from zbridge.errors import LeaseLost
 from zbridge.fleet import topics
 
@@ -179,7 +179,7 @@ def test_drive_of_a_robot_that_somebody_hostile_holds(zbridge: Any, monkeypatch:
 
 
 def test_what_drive_says_while_it_drives_and_errors_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    sitting = Session.__new__(Session)
+    sitting = DriveRun.__new__(DriveRun)
     sitting._line = ""
     sitting._say(str(LeaseLost(EVIL)))
     start, _, said = capsys.readouterr().out.partition("\x1b[K")

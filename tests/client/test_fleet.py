@@ -196,7 +196,7 @@ async def test_refusals_of_long_ago_or_of_a_listener_are_none_of_this_stop() -> 
 async def test_a_stop_taken_for_a_robot_that_cannot_be_reached_says_so(status: Status, why: str) -> None:
     world = World("r1")
     world.gateway.publish(topics.STATUS, status)
-    with pytest.raises(Refused, match=rf"^r1: stop taken, but the robot is {why}$"):
+    with pytest.raises(Refused, match=rf"^r1: stop accepted, but the robot is {why}$"):
         await world.robot.stop()
     assert world.taken("@cmd/stop") != []
 

@@ -16,7 +16,7 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import LinkStatus, Status
 
 OK, WARNING, CRITICAL = HealthLevel
-SILENT = "its gateway has said nothing for 3 s"
+SILENT = "its gateway has published nothing for 3 s"
 
 
 @pytest.mark.parametrize(

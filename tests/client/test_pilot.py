@@ -90,7 +90,7 @@ async def test_a_command_does_not_wait_for_long() -> None:
 async def test_a_command_that_waits_is_withdrawn_by_a_stop(scene: Scene) -> None:
     scene.pilot.drive(FIRST)
     scene.pilot.require_neutral("stop")
-    with pytest.raises(NeutralFirst, match="stop: release the stick first"):
+    with pytest.raises(NeutralFirst, match="stop: centre the joystick first"):
         scene.pilot.drive(SECOND)
     await asyncio.sleep(0.1)
     assert scene.driven == []
@@ -177,7 +177,7 @@ async def test_neutral_that_the_gateway_demands_is_demanded_of_the_stick(scene: 
     await asyncio.sleep(0.1)
     with pytest.raises(NeutralFirst, match="send a neutral drive first"):
         scene.pilot.drive(SECOND)
-    with pytest.raises(NeutralFirst, match="motion was refused: release the stick first"):
+    with pytest.raises(NeutralFirst, match="motion was refused: centre the joystick first"):
         scene.pilot.drive(SECOND)
     scene.pilot.drive(Drive())
     scene.pilot.drive(THIRD)

@@ -49,7 +49,7 @@ async def test_the_fleet_is_latched_by_one_id_and_released_everywhere() -> None:
     assert await world.fleet.latch(reason="fire") == dict.fromkeys(("r1", "r2", "r3"))
     ids = {latch.id for gateway in world.gateways.values() for latch in gateway.control.latches if latch.fleet}
     assert len(ids) == 1
-    with pytest.raises(Unsupported, match="of the whole fleet: release it with unlatch_fleet"):
+    with pytest.raises(Unsupported, match="belongs to the whole fleet: release it with unlatch_fleet"):
         await world.fleet["r1"].unlatch()
     assert await world.fleet.unlatch() == dict.fromkeys(("r1", "r2", "r3"))
     assert [world.gateways[name].control.state for name in ("r1", "r2", "r3")] == ["stopped", "latched", "stopped"]
@@ -80,7 +80,7 @@ async def test_a_robot_that_the_stop_of_all_did_not_reach_is_latched_by_name_and
 async def test_each_robot_has_its_outcome_confirmed_or_not() -> None:
     world = World("r1", "r2", "r3", "r4")
     world.gateways["r2"].publish(topics.STATUS, Status(state="offline", reason="no route"))
-    stalled = "the robot's link takes nothing: it is not driven"
+    stalled = "the robot's link is stalled: it is not driven"
     world.gateways["r4"].publish(topics.STATUS, Status(state="established", reason=f"{stalled}; another condition"))
     await world.gateways["r3"].vanish()
     world.bus.announce("fleet/r3/@alive/gateway")
@@ -89,7 +89,7 @@ async def test_each_robot_has_its_outcome_confirmed_or_not() -> None:
     assert world.loop.time() - asked_at < CONFIRM_S + 0.5
     assert outcomes["r1"] is None
     assert isinstance(outcomes["r2"], NotReady)
-    assert str(outcomes["r4"]) == "r4: stop taken, but it waits: the robot's link takes nothing"
+    assert str(outcomes["r4"]) == "r4: stop accepted, but it waits: the robot's link is stalled"
     assert isinstance(outcomes["r3"], BusError)
     assert world.gateways["r2"].control.state == "latched", "its gateway keeps it"
     outcomes = await world.fleet.unlatch()

@@ -132,7 +132,7 @@ def refused(authority: Authority, attachment: bytes | None, at: float = 0.0) -> 
 
 def must_be_neutral(authority: Authority, why: str) -> None:
     with pytest.raises(NeutralFirst, match=f"^{why}: send a neutral drive first$"):
-        authority.require_motion()
+        authority.check_motion()
 
 
 def test_the_table_of_the_documentation_is_the_one_that_is_executed() -> None:
@@ -157,7 +157,7 @@ def test_a_free_robot_a_higher_priority_and_a_takeover_are_granted_and_need_no_n
     ended = [f"ended ann (taken over by bob){STOPS if state in IN_MOTION else ''}"] if state in HELD else []
     assert told(authority) == [*ended, "taken over bob" if name == "takeover" else "acquired bob"]
     assert seen(authority) == ("held", False, False, NOW + LEASE_S, given.lease)
-    authority.require_motion()
+    authority.check_motion()
     assert command(attach(given, 0))(authority) == "bob", "numbers begin anew, from anywhere"
 
 
@@ -217,7 +217,7 @@ def test_a_program_whose_grant_was_lost_asks_again_and_gets_another_lease_in_pla
     assert again.lease != first.lease
     assert authority.report(NOW + 1.0).lease == again.lease
     assert told(authority) == ["ended ann (taken over by ann)", "acquired ann"], "the robot was at rest"
-    authority.require_motion()
+    authority.check_motion()
     with pytest.raises(LeaseLost):
         authority.admit(attach(ANN, SEQ), DRIVE, PAYLOAD, NOW + 1.0)
 
@@ -284,7 +284,7 @@ def test_whenever_a_lease_ends_what_moves_is_stopped_and_its_holder_drives_no_mo
     ask("acquire")(authority)
     assert str(refused(authority, attach(ANN, SEQ + 2))) == f"the lease has ended ({why})"
     assert command(attach(BOB, 0))(authority) == "bob"
-    authority.require_motion()
+    authority.check_motion()
 
 
 @pytest.mark.parametrize("state", NOT_HELD)
@@ -449,7 +449,7 @@ def test_holding_back_keeps_the_lease_and_demands_neutral(state: str, why: str, 
     assert not authority.moving
     must_be_neutral(authority, why)
     ask("takeover")(authority)
-    authority.require_motion()
+    authority.check_motion()
 
 
 def test_only_a_neutral_that_was_carried_out_allows_motion_again() -> None:
@@ -458,17 +458,17 @@ def test_only_a_neutral_that_was_carried_out_allows_motion_again() -> None:
         does(authority)
         must_be_neutral(authority, "deadman")
     NEUTRAL(authority)
-    authority.require_motion()
+    authority.check_motion()
     assert authority.state == "held"
     for state in ("held", "moving", "by itself"):
-        made(state).require_motion()
+        made(state).check_motion()
 
 
 def test_a_robot_that_moves_for_nobody_is_stopped_before_somebody_gets_it() -> None:
     authority = made("stopped")
     MOTION(authority)
     assert authority.acquire(Acquire(who="bob"), NOW).ok
-    assert told(authority) == [f"stopped (moving for nobody when bob acquired){STOPS}", "acquired bob"]
+    assert told(authority) == [f"stopped (moving without a driver when bob acquired){STOPS}", "acquired bob"]
     assert not authority.moving
     assert authority.deadline() == NOW + LEASE_S
 
@@ -480,7 +480,7 @@ def test_the_neutral_of_a_part_that_did_not_move_allows_no_motion(stops: bool) -
     applied(moving=False, part="left motor")(authority)  # a program that drives may say this all the time
     must_be_neutral(authority, "busy")
     NEUTRAL(authority)
-    authority.require_motion()
+    authority.check_motion()
 
 
 def test_each_part_that_moved_is_neutral_before_motion_or_all_at_once() -> None:
@@ -492,7 +492,7 @@ def test_each_part_that_moved_is_neutral_before_motion_or_all_at_once() -> None:
         if not whole:
             must_be_neutral(authority, "busy")
             applied(moving=False, part="left motor")(authority)
-        authority.require_motion()
+        authority.check_motion()
 
 
 # Time

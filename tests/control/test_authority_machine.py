@@ -278,7 +278,7 @@ class Driving(RuleBasedStateMachine):
 
     def needs_neutral(self) -> bool:
         try:
-            self.authority.require_motion()
+            self.authority.check_motion()
         except Refused:
             return True
         return False

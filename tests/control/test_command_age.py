@@ -61,7 +61,7 @@ class Ann:
         if moving and sender.stale:
             return False
         if moving:
-            self.authority.require_motion()
+            self.authority.check_motion()
         self.authority.applied("drive", sender.given_at, moving=moving, stale=sender.stale)
         return True
 
@@ -135,10 +135,10 @@ def test_a_stale_neutral_ends_motion_and_leaves_the_robot_needs_neutral() -> Non
     ann = Ann()
     ann.acquire()
     ann.command(1.0)
-    ann.authority.require_neutral("the robot's link took nothing")
+    ann.authority.require_neutral("the robot's link stalled")
     assert ann.command(1.1, 0.9, moving=False)
     with pytest.raises(NeutralFirst):
-        ann.authority.require_motion()
+        ann.authority.check_motion()
     assert ann.command(2.1, moving=False)
     assert ann.command(2.2)
 
@@ -172,7 +172,7 @@ def test_after_a_cut_neutral_and_push_that_waited_move_nothing() -> None:
         ann.command(tick * 0.05)
     ann.authority.expire(0.95 + WAY_S + DEADMAN_S)
     with pytest.raises(NeutralFirst):
-        ann.authority.require_motion()
+        ann.authority.check_motion()
     healed = 3.3
     for tick in range(20, 66):
         given_at = tick * 0.05

@@ -90,7 +90,7 @@ async def test_a_machine_that_was_suspended_stops_its_robot_and_ends_the_lease_b
 
 async def test_motion_that_was_stopped_while_it_was_written_is_not_counted_as_motion() -> None:
     rig = Rig()
-    rig.enforcer.require_neutral("the robot's link took nothing", stops=True)
+    rig.enforcer.require_neutral("the robot's link stalled", stops=True)
     with pytest.raises(NeutralFirst):
         rig.enforcer.moved(PATH, FORWARD, rig.now, CommandSender("a", rig.now), moving=True)
     assert not rig.authority.moving

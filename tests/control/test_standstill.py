@@ -18,7 +18,7 @@ MODE_MANUAL = bytes.fromhex("06000000 02 0a 02000000")
 FORWARD = {"forward": 1.0}
 NO_JOYSTICK = bytes.fromhex("0f000000 01 02 02 03000000 312e31 0000000000")
 """serverSettings of a 1.1 robot that announces nothing."""
-TAKES_NOTHING = "the robot's link takes nothing"
+STALLED = "the robot's link is stalled"
 
 
 async def play(rig: Rig, course: str) -> None:
@@ -148,15 +148,15 @@ async def test_a_robot_that_cannot_be_sent_its_stop_is_said_to_be_so() -> None:
 async def test_a_link_that_takes_nothing_is_said_to_be_so_and_all_but_stops_is_refused_until_it_takes_again() -> None:
     async with established(deadman_s=5.0) as rig:
         await play(rig, "drive 1; stall 0.31; drive 2")
-        assert rig.last("status")["reason"] == f"{TAKES_NOTHING}: it is not driven"
+        assert rig.last("status")["reason"] == f"{STALLED}: it is not driven"
         assert rig.metrics.total("link_stalls") == 1
         assert rig.metrics.total("drives_unwritten") >= 19
         (answer,) = rig.ask("pose").replies
-        assert str(answer.error) == TAKES_NOTHING
+        assert str(answer.error) == STALLED
         await play(rig, "mode autonomous; stall 0; drive 0.1")
         reasons = {command: reason for command, reason, _ in await rig.refusals()}
-        neutral_first = "the robot's link took nothing: send a neutral drive first"
-        assert reasons == {"mode": TAKES_NOTHING, "drive": neutral_first}
+        neutral_first = "the robot's link stalled: send a neutral drive first"
+        assert reasons == {"mode": STALLED, "drive": neutral_first}
         assert rig.last("status")["reason"] is None
 
 
@@ -166,7 +166,7 @@ async def test_a_link_is_looked_at_again_without_anything_to_write() -> None:
         await play(rig, "drive 0.2; neutral; wait 2; stall 0.1")
         rig.command("lidar", {"on": True})
         await play(rig, "stall 0.4; wait 0.5")
-        assert rig.last("status")["reason"] == f"{TAKES_NOTHING}: it is not driven"
+        assert rig.last("status")["reason"] == f"{STALLED}: it is not driven"
         rig.forget_written()
         await play(rig, "stall 0; wait 0.1")
         assert rig.written()[:1] == [STOP]

@@ -59,7 +59,7 @@ def ask(session: zenoh.Session, key: str, payload: bytes = b"", timeout_s: float
     return [msgpack.unpackb((reply.ok or reply.err).payload.to_bytes()) for reply in replies]
 
 
-ASKS_OTHERS = "the fleet's latched stops are asked for"
+ASKS_OTHERS = "querying the fleet's latched stops"
 """Why a gateway that has just started grants no lease for a moment, as clients are told."""
 
 

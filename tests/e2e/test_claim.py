@@ -25,7 +25,7 @@ CLAIM = "fleet/r1/@rpc/claim/gateway"
 TOLD = "another gateway serves this robot too: "
 LEFT = "another gateway serves r1: leaving it alone"
 YIELDED = "r1: another gateway serves it: leaving the robot alone, and staying connected"
-AGAIN = "r1: no other gateway serves it better: serving it again"
+AGAIN = "r1: no other gateway has a better claim: serving it again"
 LOOK_S = WAIT_S + WATCH_S
 
 

@@ -69,7 +69,7 @@ def test_ls_echo_and_stop_say_what_there_is_and_a_stop_takes_the_robot_from_its_
     until(lambda: "refused" in fleet.reason("r2"), what="why it is offline")
     both = zbridge("stop", "--all", *at)
     assert (both.returncode, both.stdout) == (1, "1 of 2 stopped; r2 offline\n")
-    assert both.stderr.startswith("r2: stop taken, but the robot is ")
+    assert both.stderr.startswith("r2: stop accepted, but the robot is ")
     elsewhere = zbridge("stop", "--all", "--realm", "lab", *at)
     assert (elsewhere.returncode, elsewhere.stderr) == (1, "no gateways on lab/\n")
 

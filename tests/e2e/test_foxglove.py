@@ -144,7 +144,7 @@ def test_a_stop_is_open_to_who_may_not_drive_and_who_is_stopped_must_let_go_firs
         def stopped() -> bool:
             driver.twist(1, forward=0.5)  # the button is still held
             driver.read()
-            return driver.warned("let go for a second")
+            return driver.warned("release the control for a second")
 
         until(stopped, what="a stop")
         for _ in range(10):

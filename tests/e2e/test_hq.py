@@ -90,7 +90,7 @@ async def test_a_process_without_a_robot_tells_its_programs_when_the_robot_comes
         gone = [text for text in program.texts if text in _GONE]
         assert len(gone) == 1 or bench.withheld_s > 0.5, gone  # a late listener sees its end and its status apart
         before = bench.fleet.last("r1/pose")
-        await told("release the stick first")
+        await told("centre the joystick first")
         await soon(lambda: bench.fleet.last("r1/pose")["at"] > before["at"] + 0.5, "a pose")
         after = bench.fleet.last("r1/pose")
         assert (after["x"], after["y"]) == pytest.approx((before["x"], before["y"]))
@@ -160,7 +160,7 @@ async def test_programs_that_behave_badly_cost_a_good_one_nothing_and_are_closed
 
 
 _WAYS = {
-    "stops reading": "took nothing for 5 s",
+    "stops reading": "read nothing for 5 s",
     "floods": "flood: more than 200 messages a second",
     "sends rubbish": "broken stream",
 }

@@ -110,7 +110,7 @@ async def test_programs_of_every_protocol_drive_a_robot_of_a_protocol_that_their
         for ask in (program.ask_map, program.ask_position, lambda: program.lidar(on=True), lambda: program.say("hi")):
             ask()
         program.mode(3)
-        await soon(lambda: any("only by the stick" in text for text in program.texts), "told what it cannot do")
+        await soon(lambda: any("use the joystick" in text for text in program.texts), "told what it cannot do")
         program.idle()
         program.mode(1)
         await free()

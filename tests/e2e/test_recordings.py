@@ -77,7 +77,7 @@ def test_a_recorder_that_is_killed_leaves_a_file_that_is_readable_to_the_cut(ben
         assert len(list(reader.messages())) == len(kept)
         assert not reader.ended
     said = bench.zbridge("info", str(path)).communicate(timeout=30)[0]
-    assert "not ended properly: cut off" in said
+    assert "incomplete: cut off" in said
     assert "fleet/r1/pose" in said
 
 

@@ -119,7 +119,7 @@ def test_a_successor_that_finds_a_bad_file_leaves_the_gateway_as_it_was(bench: B
     file = bench.folder / "r1.toml"
     good = file.read_text()
     file.write_text(good + "nonsense = 1\n")
-    refused(gateway, robot, bench, "the other side has ended")
+    refused(gateway, robot, bench, "the other process has ended")
     file.write_text(good.replace(str(robot.port), str(free_port())))
     refused(gateway, robot, bench, "device was changed")
     file.write_text(good)
@@ -152,7 +152,7 @@ time.sleep(60)
     [
         ("silent", "sent nothing"),
         ("newer", f"states of version 9, this gateway has {VERSION}"),
-        ("crash", "the other side has ended"),
+        ("crash", "the other process has ended"),
         ("hangs", "sent nothing for 0.5 s"),
     ],
 )

@@ -261,7 +261,7 @@ def test_a_supervisor_goes_on_by_the_installed_code_and_driven_robots_notice_not
             lambda: re.search(r"r1: process \d+ continues with its connections", supervisor.log), 20, "the next process"
         )
         os.kill(pids[2], signal.SIGSTOP)
-        until(lambda: "gave no sign of life" in supervisor.log, 20, "the one that hangs")
+        until(lambda: "sent no heartbeat" in supervisor.log, 20, "the one that hangs")
         until(lambda: re.search(r"r2: (process \d+ continues|next process in)", supervisor.log), 20, "the next process")
     supervisor.gateway("r2", not_pid=pids[2])
     until(lambda: [bench.fleet.state(f"r{number}") for number in range(3)] == ["established"] * 3, 20, "all robots")

@@ -92,9 +92,9 @@ async def test_a_process_that_hung_is_killed_and_counts_as_ended_though_nobody_h
     ending = asyncio.ensure_future(scene.process.ended())
     await asyncio.sleep(0.001)
     assert not ending.done()
-    scene.process.kill("gave no sign of life")
+    scene.process.kill("sent no heartbeat")
     scene.process.kill("another reason")
-    assert await asyncio.wait_for(ending, SOON_S) == "gave no sign of life"
+    assert await asyncio.wait_for(ending, SOON_S) == "sent no heartbeat"
     assert scene.process.is_over
     await scene.reaped()
     assert scene.process.how == "was killed by SIGKILL"

@@ -79,7 +79,7 @@ def test_a_state_of_another_version_is_refused_whatever_else_it_has() -> None:
     descriptor = os.memfd_create("state")
     try:
         os.write(descriptor, other)
-        with pytest.raises(HandoverError, match=f"version {VERSION + 1}, this code takes version {VERSION}"):
+        with pytest.raises(HandoverError, match=f"version {VERSION + 1}, this code accepts version {VERSION}"):
             restore(descriptor)
     finally:
         os.close(descriptor)

@@ -230,7 +230,7 @@ async def test_a_process_that_is_silent_for_too_long_is_killed_and_the_next_dead
     idle.watchdog.heartbeat(100.0, driven=False)
     assert scene.poll(100.0) == pytest.approx(100.0 + DRIVEN_S)
     scene.poll(100.0 + DRIVEN_S)
-    assert driven.killed == [f"gave no sign of life for {DRIVEN_S} s"]
+    assert driven.killed == [f"sent no heartbeat for {DRIVEN_S} s"]
     driven.over.set_result(9)
     assert scene.poll(101.0) == 102.0, "once a second at least"
     assert idle.killed == []

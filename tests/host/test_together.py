@@ -125,7 +125,7 @@ async def test_one_robot_is_stopped_and_started_again_while_the_others_stay(monk
         assert played.ended == ["r2"]
         assert await watch.alive("fleet/*/@alive/gateway") == [f"fleet/{name}/@alive/gateway" for name in ("r1", "r3")]
         served.start("r2", planned("r2"))
-        with pytest.raises(ValueError, match="'r2': runs already"):
+        with pytest.raises(ValueError, match="'r2': is already running"):
             served.start("r2", planned("r2"))
         await asyncio.sleep(0.1)
         assert len(await watch.alive("fleet/*/@alive/gateway")) == 3

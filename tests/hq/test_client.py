@@ -68,7 +68,7 @@ a client that is silent for too long is closed, whatever is sent to it [idle_s=3
     a is closed; ended toy.2 silent for 3 s; b is open
 a client that takes nothing is cut and costs the others nothing
     a greets; b greets; a stalls; 44 x (at 1; b hears at 1; wait 0.1); a is open; 15 x (at 1; wait 0.1); a is closed
-    ended toy.2 took nothing for 5 s; clients 3
+    ended toy.2 read nothing for 5 s; clients 3
 a client may stall now and then
     a greets; 20 x (a stalls; wait 4.0; a takes; wait 5.0); a is open
 a client may not take a byte now and then
@@ -91,7 +91,7 @@ nothing is encoded for nobody
 # Control
 a client drives until the deadman, and the lease follows
     a drives; driven 0.5; holder hq.toy.2; tokens gateway hq.toy.2; wait 1.3; a says go
-    a hears ! deadman: release the stick first; wait 2; state free; active nothing
+    a hears ! deadman: centre the joystick first; wait 2; state free; active nothing
 what was said while the process stood still moves nothing, and neutral must come anew
     a drives; b greets; b says stand; forget; frozen 0.7; b says go; a says go, stand, go; driven nothing
     holder nothing; wait 0.4; a says go; driven nothing; a says stand, go; driven 0.5
@@ -115,8 +115,8 @@ a driver that is lost in any way gives the robot back: it stalls [rate_hz=100]
 a driver that is closed gives the robot back before its last words are out [idle_s=1]
     a drives; a stalls; text last words; wait 1.5; sessions closing; state free; tokens gateway
 a refused client is told why, and not all the time
-    a greets; 10 x (a says go; wait 0.02); a hears ! connected: release the stick first; refused 10; wait 5.0; a says go
-    a hears ! connected: release the stick first
+    a greets; 10 x (a says go; wait 0.02); a hears ! connected: centre the joystick first; refused 10; wait 5.0
+    a says go; a hears ! connected: centre the joystick first
 # What waits for more of it; every step takes a millisecond.
 a half waits until it has waited long enough, and is carried out once [side=HalfSide]
     a greets; a says stand, half; wait 0.026; driven nothing; wait 0.001; driven 0.25; wait 1; driven nothing
@@ -127,8 +127,8 @@ what comes in time is carried out with a half, and the next has its own time [si
 what waits of a client that is gone is nothing [side=HalfSide]
     a greets; a says stand, half; a leaves; wait 1; driven nothing; commands 1
 what waited in a frozen process moves nothing [side=HalfSide]
-    a greets; a says stand, half; frozen 5; wait 0.05; a hears ! the gateway was frozen: release the stick first; wait 1
-    driven nothing
+    a greets; a says stand, half; frozen 5; wait 0.05; a hears ! the gateway was frozen: centre the joystick first
+    wait 1; driven nothing
 """
 
 
@@ -138,7 +138,7 @@ async def test_a_client(special: str, script: str) -> None:
 
 
 async def test_what_a_client_costs_is_counted_for_it_alone(scene: Scene) -> None:
-    await scene.play("a greets; a says ?, go; a hears ! connected: release the stick first; a stalls; b greets")
+    await scene.play("a greets; a says ?, go; a hears ! connected: centre the joystick first; a stalls; b greets")
     for number in range(LIMIT + 10):
         scene.say(topics.TEXT, Text(text=str(number)))
     scene.say(topics.LIDAR, Switch(on=True))
@@ -154,7 +154,7 @@ async def test_what_a_client_costs_is_counted_for_it_alone(scene: Scene) -> None
 # What is refused is told to the robot's gateway
 
 
-NEUTRAL_FIRST = ("neutral_first", "connected: release the stick first", 1)
+NEUTRAL_FIRST = ("neutral_first", "connected: centre the joystick first", 1)
 TOLD: dict[str, list[str | list[tuple[str, str, int]]]] = {
     "a robot that is missing is a reason where it has a gateway to be told": [
         "a greets; a says stand; robot connecting; a says go", [("not_ready", "robot connecting", 1)],
@@ -162,7 +162,7 @@ TOLD: dict[str, list[str | list[tuple[str, str, int]]]] = {
     ],
     "what the gateway-refuses by itself is not told a second time": [
         "operator-drives; a drives; a hears ! not driving: held by operator (priority 0)", [],
-        "a says go", [("neutral_first", "held by operator (priority 0): release the stick first", 1)],
+        "a says go", [("neutral_first", "held by operator (priority 0): centre the joystick first", 1)],
     ],
     "a listener that ends does not wait to tell": ["a greets; a says go, go", [NEUTRAL_FIRST]],
 }  # fmt: skip

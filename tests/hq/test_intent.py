@@ -75,17 +75,18 @@ def played(*scripts: str) -> Intent:
 
 SCRIPTS = """
 a new program must say neutral before motion
-    0 motion ! connected: release the stick first; 100 motion ! connected: release the stick first; not asking
+    0 motion ! connected: centre the joystick first; 100 motion ! connected: centre the joystick first; not asking
     101 neutral -> nothing; 101.5 motion -> acquire
 motion asks once, waits for the answer and is then sent [ready]
     0.0 motion -> acquire; 0.1 motion -> wait; 0.2 neutral -> wait; not wants release 1e9; granted 3
     0.3 motion -> send; 0.4 neutral -> send
 whoever lost the robot must say neutral, and not of a part only [driving]
-    lost stop; not held; 0.1 motion ! stop: release the stick first; 0.1 neutral of a part -> nothing; 0.2 motion ! stop
-    0.6 neutral -> nothing; 0.7 motion -> acquire; lost held by bob; not asking; 0.8 motion ! held by bob
+    lost stop; not held; 0.1 motion ! stop: centre the joystick first; 0.1 neutral of a part -> nothing
+    0.2 motion ! stop; 0.6 neutral -> nothing; 0.7 motion -> acquire; lost held by bob; not asking
+    0.8 motion ! held by bob
     0.9 neutral -> nothing; 1.0 motion -> acquire
 a refused motion makes neutral necessary and leaves the lease [driving]
-    is may steer; refused busy: map; is held; not may steer; 0.5 motion ! busy: map: release the stick first
+    is may steer; refused busy: map; is held; not may steer; 0.5 motion ! busy: map: centre the joystick first
     0.6 neutral -> send; 0.7 motion -> send
 a program that gave the robot back need not say neutral anew [driving]
     0.5 neutral -> send; released; not may steer; 5 motion -> acquire
@@ -102,7 +103,7 @@ a robot taken back from driving itself is not given away at once [on its own]
     heard 9.5; 10 mode manual -> send; not wants release 12.6; is wants release 12.8
 # Deadman
 motion that is not repeated within the deadman has ended, noticed by itself or by a message [driving]
-    expire 1.249; is may steer; expire 1.25; not may steer; is held; 1.3 motion ! deadman: release the stick first
+    expire 1.249; is may steer; expire 1.25; not may steer; is held; 1.3 motion ! deadman: centre the joystick first
     1.35 neutral -> send; 1.45 motion -> send; 2.69 motion -> send; 4 motion ! deadman
 silence after neutral is no deadman [driving]
     0.1 neutral -> send; 2.9 motion -> send
@@ -112,7 +113,7 @@ neutral of one part, or a mode, does not put the deadman of the others off [driv
     0.1 neutral of a part -> send; 1 mode autonomous -> send; 1.1 mode manual -> send; expire 1.25; is needs neutral
 # What may have waited in the network
 a push right behind the neutral that ends a silence moves nothing, however often both come [driving]
-    heard 0.1; 0.1 motion -> send; expire 1.4; heard 2.4; 2.4 neutral -> send; 2.4 motion ! deadman: release the stick
+    heard 0.1; 0.1 motion -> send; expire 1.4; heard 2.4; 2.4 neutral -> send; 2.4 motion ! deadman: centre the joystick
     2.45 neutral -> send; 2.5 motion ! deadman; heard 2.7; 2.7 motion ! deadman; is needs neutral
 a neutral after a silence counts once three tenths of a second pass without motion [driving]
     heard 0.1; 0.1 motion -> send; expire 1.4; heard 2.4; 2.4 neutral -> send; heard 2.6; 2.6 neutral -> send
@@ -122,7 +123,7 @@ it counts without another one, too [driving]
     expire 2.71; not needs neutral; heard 2.8; 2.8 motion -> send
 mode autonomous behind it is motion [choosing]
     heard 0.1; 0.1 mode autonomous -> acquire; granted 3; lost stop; heard 2.0; 2.0 neutral -> nothing
-    2.1 mode autonomous ! stop: release the stick first; 2.4 mode autonomous ! stop; 2.5 neutral -> nothing
+    2.1 mode autonomous ! stop: centre the joystick first; 2.4 mode autonomous ! stop; 2.5 neutral -> nothing
     2.81 mode autonomous -> acquire
 a neutral still ends motion at once, and one without a silence before it counts at once [driving]
     heard 0.1; 0.1 motion -> send; heard 1.3; 1.3 motion -> send; heard 2.6; 2.6 neutral -> send; 2.61 motion ! deadman
@@ -141,12 +142,12 @@ a new program was not silent
 # Control modes
 a stick that was pushed while the mode was none moves nothing when the mode is chosen [choosing]
     0.5 motion ! control mode is none; not asking; 0.61 mode manual -> nothing
-    0.7 motion ! control mode is none: release the stick first; 0.8 neutral -> nothing; 0.9 motion -> acquire
+    0.7 motion ! control mode is none: centre the joystick first; 0.8 neutral -> nothing; 0.9 motion -> acquire
 a mode that motion has overtaken is no mode that came too late [choosing]
     1 motion ! control mode is none; 1.05 mode manual -> nothing; not needs neutral; 1.5 motion -> acquire
 a mode after motion that came twice is one that came too late [choosing]
     1 motion ! control mode is none; 1.5 motion ! control mode is none; 1.55 mode manual -> nothing
-    2 motion ! control mode is none: release the stick
+    2 motion ! control mode is none: centre the joystick
 a mode stands through release, loss and neutral, and alone moves nothing [choosing]
     0.1 mode manual -> nothing; 0.2 motion -> acquire; granted 3; lost stop; 0.3 neutral -> nothing
     0.4 motion -> acquire; granted 3; 0.5 neutral -> send; released; 0.6 motion -> acquire
@@ -158,7 +159,7 @@ a mode while the robot is held is sent and while it is asked for waits [choosing
     0 mode manual -> nothing; 0.1 motion -> acquire; 0.2 mode autonomous -> wait; 0.3 mode manual -> wait; granted 3
     0.4 mode autonomous -> send; 0.5 mode manual -> send
 mode autonomous is motion, and stands although it was refused: programs say it once
-    0 mode none -> nothing; 0 mode autonomous ! connected: release the stick first; not asking; 0.1 neutral -> nothing
+    0 mode none -> nothing; 0 mode autonomous ! connected: centre the joystick first; not asking; 0.1 neutral -> nothing
     0.2 mode autonomous -> acquire; lost stop; 0.3 neutral -> nothing; 0.4 mode autonomous -> acquire; granted 3
 # Giving back
 neutral for the time of the lease gives the robot back [driving for 2 s]

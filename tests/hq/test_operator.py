@@ -257,7 +257,7 @@ SCRIPTS = """
 motion acquires the robot and is then carried out
     say stand, go; now -> nothing; done -> go; held True; active True; holder hq.toy.1; tokens hq.toy.1
 nothing moves and nothing is asked before neutral nor by neutral
-    go ! connected: release the stick first; go ! connected: release the stick first; stand, stand -> nothing
+    go ! connected: centre the joystick first; go ! connected: centre the joystick first; stand, stand -> nothing
     asked nothing; tokens nothing; active False
 of motion said while the answer is awaited the newest counts
     stand, drive forward=0.1, drive forward=0.9 -> drive forward=0.9; asked acquire; held True
@@ -267,18 +267,18 @@ an answer that comes after the deadman moves nothing
     say stand, go; wait 1.25; done -> nothing; held True; go ! deadman
 a robot that somebody else drives is refused, told once, and neutral must come
     operator-drives; stand, go -> nothing; told not driving: held by operator (priority 0); active False
-    go ! held by operator (priority 0): release the stick first; shown; told nothing
+    go ! held by operator (priority 0): centre the joystick first; shown; told nothing
 a robot that is not there is not asked for: robot offline: no route
     robot offline no route; say stand; go ! robot offline: no route; robot established; gateway-there
-    go ! robot offline: no route: release the stick first; program 2 modes; say stand; robot offline no route
+    go ! robot offline: no route: centre the joystick first; program 2 modes; say stand; robot offline no route
     mode autonomous ! robot offline: no route; asked nothing
 a robot that is not there is not asked for: robot connecting
     robot connecting; say stand; go ! robot connecting; robot established; gateway-there
-    go ! robot connecting: release the stick first; program 2 modes; say stand; robot connecting
+    go ! robot connecting: centre the joystick first; program 2 modes; say stand; robot connecting
     mode autonomous ! robot connecting; asked nothing
 a robot that is not there is not asked for: no gateway serves the robot
     gateway-gone; say stand; go ! no gateway serves the robot; robot established; gateway-there
-    go ! no gateway serves the robot: release the stick first; program 2 modes; say stand; gateway-gone
+    go ! no gateway serves the robot: centre the joystick first; program 2 modes; say stand; gateway-gone
     mode autonomous ! no gateway serves the robot; asked nothing
 commands that are open to all need no lease and no neutral
     stop, lidar, sensor -> stop, lidar, sensor; asked nothing
@@ -318,7 +318,7 @@ the mode is told to a robot before the motion, and alone moves nothing [modes]
 a robot of another protocol is told no mode [modes]
     other-robot; stand, mode manual, go -> go; mode none -> nothing; state free
 a robot of another protocol is not taken to move by itself, but can be driven [modes]
-    other-robot; say stand; mode autonomous ! the robot does not move by itself; done -> nothing; asked nothing
+    other-robot; say stand; mode autonomous ! this robot has no autonomous mode; done -> nothing; asked nothing
     go -> go
 mode none is told and gives the robot back [modes]
     stand, mode manual, go -> mode manual, go; mode none -> mode none; asked acquire release; state free
@@ -330,14 +330,14 @@ mode none while the answer is awaited gives back what was granted [modes]
     stand, mode manual, go, mode none -> nothing; asked acquire release; state free; active False
 a stop ends the drive and neutral must come
     stand, go -> go; somebody-stops; shown; done -> nothing; told not driving: the lease has ended (stop)
-    go ! the lease has ended (stop): release the stick first; done -> nothing; asked acquire renew; stand, go -> go
+    go ! the lease has ended (stop): centre the joystick first; done -> nothing; asked acquire renew; stand, go -> go
     holder hq.toy.1
 a takeover is noticed and told once
     stand, go -> go; operator-takes-over; shown; done -> nothing; shown; done -> nothing
     told not driving: the lease has ended (taken over by operator); active False
 the gateway going away ends the drive and is nothing to an idle program
     gateway-lost; told nothing; stand, go -> go; gateway-lost; gateway-lost
-    told not driving: the robot's gateway is gone; go ! the robot's gateway is gone: release the stick first
+    told not driving: the robot's gateway is gone; go ! the robot's gateway is gone: centre the joystick first
 what a listener tells of refusals is nothing to a program whoever it names
     stand, go -> go; refused neutral_first 1 hq.toy; done -> nothing; told nothing; asked acquire; go -> go
 what was refused to a program of this name before is not told
@@ -395,7 +395,7 @@ async def test_what_is_asked_for_names_the_program_its_deadman_and_its_token(sce
 async def test_a_robot_that_must_hear_neutral_first_makes_the_program_say_it(scene: Scene) -> None:
     await scene.play(DRIVES)
     await scene.play("busy busy: map; say go; shown; told drive: busy: map: send a neutral drive first")
-    await scene.play("go ! motion was refused: release the stick first; stand, go -> stand, go")
+    await scene.play("go ! motion was refused: centre the joystick first; stand, go -> stand, go")
 
 
 async def test_mode_autonomous_keeps_the_lease_while_anything_is_heard(scene: Scene) -> None:

@@ -65,4 +65,4 @@ async def test_a_question_without_an_answer_is_answered_with_what_is_known(
 async def test_a_question_that_no_robot_is_asked_is_refused(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(COMMANDS, b"sessions?", (topics.RPC_SESSIONS("x"), Query()))
     (program,) = scene.greeted(1)
-    assert await program.said(b"sessions?") == [b"! robots are not asked for @rpc/sessions/x"]
+    assert await program.said(b"sessions?") == [b"! @rpc/sessions/x cannot be queried"]

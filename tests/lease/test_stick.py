@@ -63,8 +63,8 @@ motion acquires, waits for the lease, and is sent with it
     0.4 neutral -> send; due inf
 who lost the lease must be centred once
     0 motion -> acquire; granted; lost taken by bob; needs neutral taken by bob
-    0.1 motion ! taken by bob: release the stick first; 0.2 neutral -> nothing; 0.3 motion -> acquire; lost held by bob
-    0.4 motion ! held by bob
+    0.1 motion ! taken by bob: centre the joystick first; 0.2 neutral -> nothing; 0.3 motion -> acquire
+    lost held by bob; 0.4 motion ! held by bob
 who released it need not
     0 motion -> acquire; granted; released; 0.1 motion -> acquire
 a stop that is on its way withdraws motion, with the lease and without
@@ -78,7 +78,7 @@ the lease is had without motion by who needs neutral, and moves nothing before i
     lost stop; 0 want -> acquire; granted; 0.1 motion ! stop; 0.2 neutral -> send; 0.3 motion -> send
 motion that is not repeated ends, and the lease outlasts it [by hand]
     0 motion -> acquire; granted; due 0.5; 0.4 motion -> send; due 0.9; 0.8 time -> nothing; 0.9 time -> nothing
-    needs neutral deadman; due inf; 1.0 motion ! deadman: release the stick first; 1.1 neutral -> send
+    needs neutral deadman; due inf; 1.0 motion ! deadman: centre the joystick first; 1.1 neutral -> send
     1.2 motion -> send
 a late motion is noticed by itself [by hand]
     0 motion -> acquire; granted; 0.5 motion ! deadman
@@ -113,7 +113,7 @@ def test_what_a_stick_says_becomes_of_it(special: str, script: str) -> None:
 
 def test_a_stick_may_need_neutral_from_the_beginning() -> None:
     stick = Stick(StickRules(), "connected")
-    play(stick, "0 motion ! connected: release the stick first")
+    play(stick, "0 motion ! connected: centre the joystick first")
     play(stick, "0.1 neutral -> nothing")
     play(stick, "0.2 motion -> acquire")
 

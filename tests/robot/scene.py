@@ -41,7 +41,7 @@ from zbridge.fleet.topics import KeySpace
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.protocol.session_table import SessionTable
-from zbridge.robot.device import Device
+from zbridge.robot.device import RobotDevice
 from zbridge.transport.conversation import Conversation
 from zbridge.transport.fake import FakeLink
 
@@ -194,7 +194,7 @@ class Rig:
         self.unreachable: str | None = None
         self.settings = SETTINGS
         self.audit_lines: list[str] = []
-        self.device = Device(
+        self.device = RobotDevice(
             TcpUdpRobot(TcpUdpOptions()),
             (ADDRESS,),
             protocol="tcpudp",

@@ -733,7 +733,7 @@ def raise_key_error(*arguments: object) -> None:
 
 
 KEY_ERROR = r"a fault of the protocol: KeyError: 1 in \S+ \(test_device.py:\d+\)"
-NO_OUTCOME = r"a fault of the protocol: TypeError: RobotSide.command gave no Outcome in \S+ \(commands.py:\d+\)"
+NO_OUTCOME = r"a fault of the protocol: TypeError: RobotSide.command returned no Outcome in \S+ \(commands.py:\d+\)"
 
 
 @pytest.mark.parametrize(

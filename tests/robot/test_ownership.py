@@ -258,7 +258,7 @@ async def test_a_token_without_a_claim_behind_it_is_said_once_and_ignored(caplog
     with caplog.at_level(logging.WARNING):
         await asyncio.wait_for(Ownership(bus, KEYS).take(), 5.0)
     assert [record.getMessage() for record in caplog.records] == [
-        "there is a token of a gateway of r1 and no gateway that answers: it is ignored"
+        "a gateway of r1 has a token but does not answer: ignoring it"
     ]
 
 

@@ -93,7 +93,7 @@ _STOP = CommandFilter._stop
 MUTANTS: tuple[Broken, ...] = (
     ("a latched robot is given away", _with_action(Authority, _refuse_latched, AuthorityState.HELD)),
     ("no deadman", _with_action(Authority, _move)),
-    ("neutral is not required", _method(Authority, "require_motion", lambda self: None)),
+    ("neutral is not required", _method(Authority, "check_motion", lambda self: None)),
     ("an ended lease stops nothing", _with_action(Authority, _end)),
     ("stale motion is obeyed", _method(CommandAge, "is_stale", _never_stale)),
     ("an expiry is not noticed", _without_table_entry(Authority, "held", "lease expired")),

@@ -330,7 +330,7 @@ class World:
         if command.what in MOVES:
             if sender.stale:
                 raise Stale("given too long ago")
-            self.authority.require_motion()
+            self.authority.check_motion()
 
     def _tell(self, command: Command, sender: CommandSender) -> None:
         what = command.what

@@ -11,7 +11,7 @@ from zbridge.bus import Neighbour, Tls
 from zbridge.errors import Refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import Membership
-from zbridge.security.router import FOLD_S, KINDS, Router, ZenohWarnings, in_our_words
+from zbridge.security.router import FOLD_S, KINDS, Router, ZenohWarnings, translate_log_line
 from zbridge.security.router_settings import RouterPlan, RouterSettings
 
 HINT = ". Hint: increase the system open file limit."
@@ -79,7 +79,7 @@ def test_who_comes_and_goes_is_logged_and_an_unknown_name_is_a_warning(
 
 @pytest.mark.parametrize(("said", "words"), LINES)
 def test_zenohs_warnings_are_said_in_words(said: str, words: str) -> None:
-    level, text = in_our_words(HEAD + said)
+    level, text = translate_log_line(HEAD + said)
     assert words in text
     assert level == logging.WARNING
     assert "Hint" not in text
@@ -87,9 +87,9 @@ def test_zenohs_warnings_are_said_in_words(said: str, words: str) -> None:
 
 def test_any_other_line_keeps_its_level_and_loses_its_place_in_zenohs_source() -> None:
     line = "2026-11-22T03:48:39.7Z ERROR ThreadId(10) zenoh::net: Broken. at /root/zenoh/src/net/x.rs:388."
-    assert in_our_words(line) == (logging.ERROR, "Zenoh: zenoh::net: Broken.")
-    assert in_our_words("a line of something else")[0] == logging.DEBUG
-    assert in_our_words(HEAD + "Unable to open listener tcp/1: in use")[0] == logging.DEBUG
+    assert translate_log_line(line) == (logging.ERROR, "Zenoh: zenoh::net: Broken.")
+    assert translate_log_line("a line of something else")[0] == logging.DEBUG
+    assert translate_log_line(HEAD + "Unable to open listener tcp/1: in use")[0] == logging.DEBUG
 
 
 def test_a_warning_that_repeats_is_logged_once_and_counted(caplog: pytest.LogCaptureFixture) -> None:

@@ -167,7 +167,7 @@ class SimChannel(HandoverChannel):
             if not end.descriptors:
                 if loop.time() >= ends_at or end.peer.closed or end.closed:
                     Parcel(sockets, SimKernel(end.process, loop.network)).close()
-                    raise HandoverError(f"{len(sockets)} descriptors came of {descriptors}")
+                    raise HandoverError(f"{len(sockets)} of {descriptors} descriptors were received")
                 await end.wait(ends_at - loop.time())
                 continue
             for thing in end.descriptors.popleft():

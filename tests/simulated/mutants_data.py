@@ -242,7 +242,7 @@ MUTANTS = (
         "drives wait for a stalled link for ever",
         "situations",
         PRESENCE,
-        '            self._enforcer.require_neutral("the robot\'s link took nothing", stops=True)',
+        '            self._enforcer.require_neutral("the robot\'s link stalled", stops=True)',
         "            pass",
     ),
     Mutant(

@@ -14,7 +14,7 @@ SETTLED_S = 1.5
 """Longest time that a handshake takes once the connection is there and the robot takes commands."""
 RIVAL_S = 5.0
 """Longest time until a gateway has found that another one is gone: it asks every 0.5 s, for 1 s, and looks thrice."""
-STALLED = "the robot's link takes nothing"
+STALLED = "the robot's link is stalled"
 RECOVERED_S = 3.0
 """Longest time until a link that works again is shown to do so: TCP sends again within a second."""
 RIVALS = ("another gateway serves", "a second connection is open")

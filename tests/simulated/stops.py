@@ -24,7 +24,7 @@ ASKED_S = 5.0
 """Longest time that a program takes to confirm a stop."""
 SILENCE_S = 2.5
 """Seconds after packet 4 in which a TCP/UDP robot gets nothing but a packet 7."""
-STALLED = "the robot's link takes nothing"
+STALLED = "the robot's link is stalled"
 SHOWN_S = 1.0
 """Seconds after which a program that asks for ``status`` has what the gateway shows."""
 ON_ITS_WAY_S = 0.15
@@ -92,7 +92,7 @@ class StopRules:
             self._stopped_at[gateway] = self._world.now
 
     def tick(self) -> None:
-        """ReadPayload for a robot that nobody drives, and that is sent no stop."""
+        """Look for a robot that nobody drives, and that is sent no stop."""
         now, checker = self._world.now, self._checker
         gateway = checker.obligations.works()
         if gateway != self._works[0]:

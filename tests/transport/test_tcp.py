@@ -235,5 +235,5 @@ async def test_a_platform_that_tells_nothing_is_said_once_and_has_no_gate(monkey
             await asyncio.sleep(STALLED_S + 0.1)
             assert pair.here.unacknowledged_s == 0.0
     assert [record.message for record in caplog.records if "acknowledged" in record.message] == [
-        "this platform does not tell what robots acknowledged: drives are written to broken links too"
+        "this platform does not report unacknowledged bytes: drives are also written to broken links"
     ]

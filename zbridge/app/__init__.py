@@ -1,6 +1,6 @@
 """One gateway process: its configuration, the gateway made of it, templates, counters for Prometheus, restarts.
 
-Puts the rooms below together. Knows no protocol (entry points find them), no terminal and no other gateway of its host.
+Combines the packages below. Knows no protocol (entry points find them), no terminal and no other gateway of the host.
 """
 
 from zbridge.app.config import GatewayPlan, load, plan

@@ -87,7 +87,7 @@ def load(
 ) -> GatewayPlan:
     """Read and check a configuration file; raise ConfigError, which names the file as well.
 
-    tls: a folder as ``zbridge certs bundle`` makes it, for a file without ``bus.tls``; so does ``ZBRIDGE_TLS``. Paths
+    tls, or ``ZBRIDGE_TLS``: a folder made by ``zbridge certs bundle``, for a file without ``bus.tls``. Paths
     in ``bus.tls`` are relative to the file. content: of the file, if it was read already.
     """
     raw = parse_toml(path, read_file(path, waits=True) if content is None else content)
@@ -121,7 +121,7 @@ def plan(raw: dict[str, Any], environment: Mapping[str, str] = os.environ) -> Ga
         if not is_name(name):
             raise ConfigError(f"{key} = {name!r}: expected letters, digits, '_', '.' and '-' only")
     if config.device is None and not config.hq:
-        raise ConfigError("device: missing, it is required where there is no [[hq]]")
+        raise ConfigError("device: missing, it is required without [[hq]]")
     device = _device(config.device) if config.device is not None else None
     listeners = tuple(_listener(settings, f"hq[{number}]") for number, settings in enumerate(config.hq))
     named = Counter(settings.name for settings in config.hq if settings.name is not None)
@@ -135,7 +135,7 @@ def plan(raw: dict[str, Any], environment: Mapping[str, str] = os.environ) -> Ga
     metrics = _metrics_address(config.metrics.listen) if config.metrics else None
     camera = plan_camera(config.camera) if config.camera is not None else None
     if camera is not None and device is None:
-        raise ConfigError("camera: expected only where there is a table device")
+        raise ConfigError("camera: expected only with a table device")
     return GatewayPlan(config, device, listeners, metrics, camera)
 
 
@@ -179,7 +179,7 @@ def _listener_tls(key: str, settings: HqSettings, address: Address) -> SSLContex
     if tls is None:
         return None
     if not address.tls:
-        raise ConfigError(f"{key}.listen = {settings.listen!r}: expected tls://host:port, for there is a table tls")
+        raise ConfigError(f"{key}.listen = {settings.listen!r}: expected tls://host:port, because there is a table tls")
     with prefixed(f"{key}.tls: ", LinkError):
         return server_context(tls.certificate, tls.key, tls.ca)
 

@@ -1,8 +1,8 @@
 """One gateway process, from its plan to its end. Knows no protocol.
 
-Theory of operation. The bus is opened first, and again until that succeeds. Listeners run from then on. The device side
-runs only while this process owns the robot (:class:`Ownership`): it waits while another gateway does. What one part
-raises ends all others; each part leaves its peers in order before the bus is closed.
+Theory of operation. The gateway tries to open the bus until that succeeds. Then it runs its listeners. The device side
+runs only while this process owns the robot (:class:`Ownership`), and waits while another gateway does. An exception of
+one part ends all others; each part takes leave of its peers before the bus is closed.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.protocol.kept import Exported
 from zbridge.protocol.session_table import SessionTable
-from zbridge.robot.device import Device
+from zbridge.robot.device import RobotDevice
 from zbridge.robot.observer import Observer
 from zbridge.robot.ownership import Ownership
 from zbridge.robot.settings import DevicePlan
@@ -59,7 +59,7 @@ LINGER_S = 0.2
 class Neighbourhood(msgspec.Struct, frozen=True):
     """What a gateway shares with others of its process.
 
-    part: of the processor, that its robot may use for long. buffer: where all links of the loop read.
+    part: the part of the processor that its robot may use in the long run. buffer: all links of the loop read into it.
     """
 
     part: float
@@ -70,8 +70,8 @@ class Gateway:
     """A gateway of one robot: its device side, its listeners, or both, as the plan says.
 
     metrics, sessions, conditions: of this gateway, shared by all parts. observer: a supervisor, notified of the robot's
-    links. predecessor: the channel to a gateway that hands everything over. successor: starts a process to which this
-    one can be handed over. runtime: the machine below.
+    links. predecessor: the channel to the gateway that hands over to this one. successor: starts the process that this
+    one hands over to. runtime: clocks, processes and sockets of the machine.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class Gateway:
         self.restarts = Restarts(
             plan, self._keys, self._incoming, successor, runtime.clock, runtime.processes, runtime.kernel
         )
-        """What a successor would be handed, and how."""
+        """What is handed to a successor, and how."""
         self.left = True
         """Whether the bus was closed in order; if not, one of its threads may hang."""
         self.metrics = metrics or Metrics()
@@ -116,7 +116,7 @@ class Gateway:
     async def run(self) -> None:
         """Serve the robot and its HQ programs until cancelled; then stop the robot and close the bus.
 
-        Returns where a successor was handed everything. Raises HandoverError where this one gets nothing.
+        Returns if everything was handed to a successor. Raises HandoverError if the predecessor hands over nothing.
         """
         with open_audit(self._plan, self.metrics, self.conditions) as audit:
             while True:
@@ -137,9 +137,9 @@ class Gateway:
                     self.left = await bus.close()
 
     async def run_on(self, bus: Bus, neighbourhood: Neighbourhood | None = None) -> None:
-        """Do the same on a bus, and beside metrics, that somebody else opens and closes.
+        """Do the same on a bus and with metrics that the caller opens and closes.
 
-        neighbourhood: None where the process serves this robot only.
+        neighbourhood: None if the process serves this robot only.
         """
         self._neighbourhood = neighbourhood
         with open_audit(self._plan, self.metrics, self.conditions) as audit:
@@ -171,7 +171,7 @@ class Gateway:
             await until(self.restarts.gone, together(*work, first=self.restarts.settle))
 
     async def _serve_metrics(self, address: Address) -> None:
-        """Serve the counters, once a predecessor has let go."""
+        """Serve the counters, once the predecessor has released them."""
         await self._incoming.begun.wait()
         sockets = [self._runtime.kernel.adopt(self._incoming.parcel.take(n)) for n in self._incoming.state.metrics]
         async with serve_metrics(address, self.metrics, self.missing, sockets) as self.restarts.metrics_sockets:
@@ -182,7 +182,7 @@ class Gateway:
         names = listener_names(plans, self._own, bus.zid)
         self._process = process_name(names, self._own, bus.zid) if names else "gateway"
         exported: list[tuple[Exported, Parcel] | None] = [None] * len(plans)
-        if incoming.state.listeners:  # a gateway that died leaves none: they are bound anew
+        if incoming.state.listeners:  # a gateway that died hands over none: bind them again
             exported = [(each, incoming.parcel) for each in incoming.state.listeners]
         return [
             Listener(
@@ -201,7 +201,7 @@ class Gateway:
         ]
 
     def missing(self) -> tuple[str, ...]:
-        """Give the reasons for which this gateway is of no use now: no bus, or its robot is not established."""
+        """Return why this gateway cannot serve its robot now: no bus, or the robot is not established."""
         reasons = [] if self._on_the_bus or self._plan.config.bus.alone_is_normal else ["no bus"]
         if self._plan.device is not None:
             state = self._serving.state if self._serving is not None else SERVED_ELSEWHERE
@@ -256,9 +256,9 @@ class Gateway:
         return bus.answer(self._keys.key(topics.RPC_SESSIONS(who).path), answer)
 
     async def _serve(
-        self, bus: Bus, ownership: Ownership, device: Device, store: LatchStore, begin: Begin | None = None
+        self, bus: Bus, ownership: Ownership, device: RobotDevice, store: LatchStore, begin: Begin | None = None
     ) -> None:
-        """Serve the robot, and its camera, until another gateway has to take it."""
+        """Serve the robot, and its camera, until another gateway takes it over."""
         self.restarts.device, camera = device, None
         if self._plan.camera is not None:
             from zbridge.camera.camera import Camera
@@ -276,11 +276,11 @@ class Gateway:
         finally:
             self.restarts.device = self._serving = None
 
-    def _make_device(self, bus: Bus, audit: Audit, plan: DevicePlan, store: LatchStore) -> Device:
+    def _make_device(self, bus: Bus, audit: Audit, plan: DevicePlan, store: LatchStore) -> RobotDevice:
         near, runtime = self._neighbourhood, self._runtime
         control = self._plan.config.control
         limited = control.rate_hz is not None or control.slew_per_s is not None
-        return Device(
+        return RobotDevice(
             plan.make_robot(self.metrics),
             plan.addresses,
             protocol=plan.protocol.name,

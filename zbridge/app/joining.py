@@ -1,10 +1,10 @@
-"""A gateway joins the bus, and again until that succeeds; it leaves a session that is of no use any more.
+"""Joins the bus, retrying until that succeeds, and leaves a session that has become useless.
 
-Zenoh's session would knock with an expired certificate every 4 s for good, and each time the router accepts nobody for
-0.1 s. So a gateway whose certificate has expired leaves, and tries rarely, with the file as it is then.
+Zenoh's session would retry with an expired certificate every 4 s forever, and each attempt blocks the router for 0.1 s.
+So a gateway whose certificate has expired leaves, and retries rarely, with the file as it is then.
 
 After a cut of the network a session of Zenoh 1.10 may never connect again (eclipse-zenoh/zenoh#1876). A gateway that
-has no connection for long therefore tries with a second session, and leaves the first one where only that one connects.
+has had no connection for long therefore opens a second session, and leaves the first one if only the second connects.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ log = logging.getLogger("zbridge.app.gateway")
 RETRY_S = 1.0
 """Seconds between attempts to open the bus, while no router is there."""
 OPEN_MOST_S = 4.0
-"""Longest time that an attempt is given; a process that ends waits for the attempt."""
+"""Time limit of an attempt; a process that ends waits for the attempt."""
 EXPLAIN_FROM, EXPLAIN_EVERY = 2, 10
 """The third attempt that fails, and every tenth after it, asks the router why: a thousand that ask would keep it from
-letting them in."""
+accepting any."""
 RARELY_S = 60.0
-"""Longest time between two attempts after refusals: each costs the router, and with it everybody, 0.1 s."""
+"""Longest time between two attempts after refusals: each blocks the router for 0.1 s."""
 CHECK_S = 3600.0
 """Seconds between checks of the certificate's end."""
 LOG_S = 86_400.0
@@ -51,7 +51,7 @@ _CERTIFICATE = "certificate"
 
 
 class SessionUseless(BusError):
-    """This session will not connect again: it is left, and the bus joined with a new one."""
+    """This session does not reconnect: leave it, and join the bus with a new one."""
 
 
 class CertificateEnded(SessionUseless):
@@ -59,7 +59,7 @@ class CertificateEnded(SessionUseless):
 
 
 class Pauses:
-    """How long to wait before the next attempt: a while after a router that is away, more and more after refusals.
+    """The pauses between attempts: constant while the router is away, growing with refusals.
 
     chance: between 0 and 1; it keeps gateways that were refused together from coming back together.
     """
@@ -87,7 +87,7 @@ class Pauses:
 
 
 async def join_bus(plan: GatewayPlan, metrics: Metrics) -> Bus:
-    """Open the bus; try again until that succeeds, rarely where the router refuses.
+    """Open the bus, retrying until that succeeds; rarely if the router refuses.
 
     A thousand others may wait for the same router: attempts are given more time, and come at other times than theirs.
     """
@@ -108,11 +108,11 @@ async def join_bus(plan: GatewayPlan, metrics: Metrics) -> Bus:
             pause = pauses.after(error)
             log.warning("no bus: %s; next attempt in %.2g s", error, pause)
             await asyncio.sleep(pause)
-    raise AssertionError("it tries for ever")
+    raise AssertionError("the session retries forever")
 
 
 async def can_connect(plan: GatewayPlan) -> bool:
-    """Whether a new session connects to the bus; it is closed again."""
+    """Return whether a new session connects to the bus; close it again."""
     try:
         bus = await open_bus(plan.config.bus, Metrics(), within_s=OPEN_S, explain=False)
     except BusError:
@@ -122,7 +122,7 @@ async def can_connect(plan: GatewayPlan) -> bool:
 
 
 async def watch_session(plan: GatewayPlan, bus: Bus, can_connect: Callable[[GatewayPlan], Awaitable[bool]]) -> None:
-    """Raise SessionUseless where a client's session does not connect again, and a new one does."""
+    """Raise SessionUseless if a client's session does not reconnect while a new one connects."""
     changed, here = asyncio.Event(), False
 
     def connected(is_here: bool) -> None:
@@ -144,7 +144,7 @@ async def watch_session(plan: GatewayPlan, bus: Bus, can_connect: Callable[[Gate
             changed.clear()
             await changed.wait()
         if not await returns(STUCK_S) and await can_connect(plan) and not await returns(RECONNECTS_S):
-            raise SessionUseless("Zenoh's session does not connect again, and a new one does: the bus is joined anew")
+            raise SessionUseless("Zenoh's session does not reconnect, but a new one connects: joining the bus anew")
 
 
 async def watch_certificate(

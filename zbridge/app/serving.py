@@ -20,7 +20,7 @@ from zbridge.control.latch import LatchRecord
 from zbridge.control.latch_store import LatchStore
 from zbridge.errors import Held
 from zbridge.robot.claim import Claim, Standing
-from zbridge.robot.device import Device
+from zbridge.robot.device import RobotDevice
 from zbridge.robot.ownership import Ownership
 
 log = logging.getLogger("zbridge.app.gateway")
@@ -46,7 +46,7 @@ class Serving:
     def __init__(
         self,
         robot: str,
-        device: Device,
+        device: RobotDevice,
         ownership: Ownership,
         store: LatchStore,
         conditions: Conditions,
@@ -77,7 +77,7 @@ class Serving:
         return SERVED_ELSEWHERE if self._ownership.yielded else self._device.state
 
     async def run(self, begin: Begin | None = None) -> None:
-        """Serve until another gateway has to take the robot, or a successor has it. begin: see :meth:`Device.run`."""
+        """Serve until another gateway or a successor takes the robot over. begin: see :meth:`RobotDevice.run`."""
         if not self._ownership.yielded:
             self._open()
         work = (self._device.run(begin), self._ownership.watch(self), self._camera_failed)

@@ -1,8 +1,8 @@
 """The bus: what gateways and clients use of Zenoh, its implementation, and a fake for tests.
 
-Knows no robot and no protocol. ``interface`` is what others use; ``inbox`` carries what comes in to the event loop,
-``writer`` what goes out from it; ``zenoh`` alone imports zenoh, and is imported when a bus is opened: whatever needs no
-bus starts without it.
+Knows no robot and no protocol. ``interface`` is what others use; ``inbox`` carries input to the event loop, ``writer``
+output from it. Only ``zenoh`` imports zenoh; it is imported when a bus is opened, so that programs without a bus start
+without it.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from zbridge.fleet.topics import SizeBounds
 from zbridge.metrics import Metrics
 
 OPEN_S = 1.0
-"""Longest time one attempt to open a client session takes."""
+"""Time limit of one attempt to open a client session, seconds."""
 
 __all__ = [
     "OPEN_S",
@@ -47,10 +47,10 @@ __all__ = [
     "Sample",
     "Sort",
     "Tls",
-    "hear_zenoh",
     "open_bus",
     "open_router",
     "read_key_expr",
+    "read_zenoh_log",
 ]
 
 
@@ -67,14 +67,13 @@ async def open_bus(
     explain: bool = True,
     threads: bool = True,
 ) -> Bus:
-    """Open a Zenoh session; raise BusError where that is not possible (a client: no router within ``within_s``).
+    """Open a Zenoh session; raise BusError if that is not possible (a client: no router within ``within_s``).
 
-    The error says which case it is, where that can be found within three more seconds; it is BusRefused where trying
-    again soon helps nobody. wait_for_peers: return only when the peers that scouting finds at once are connected.
-    bounds: Zenoh drops what comes in on these keys and is larger; nobody can count it. realm, robot: on a secure bus,
-    those in which the router must know our name. timestamps: Zenoh stamps what is put here, as kept frames need.
-    threads: each subscription has a thread, which spares Zenoh's where samples come by tens of thousands a second;
-    False spares each sample a way between threads.
+    The error names the cause if that can be found within three more seconds; it is BusRefused if retrying soon is
+    useless. wait_for_peers: return only when the peers that scouting finds at once are connected. bounds: Zenoh drops
+    larger input on these keys, uncounted. realm, robot: on a secure bus, those for which the router must know our name.
+    timestamps: Zenoh stamps what is put here; kept frames need that. threads: each subscription has a thread, which
+    relieves Zenoh's own at tens of thousands of samples a second; False saves each sample a change of threads.
     """
     from zbridge.bus.zenoh import open_zenoh
 
@@ -95,7 +94,7 @@ async def open_bus(
 async def open_router(
     values: Mapping[str, Any], metrics: Metrics, on_neighbour: Callable[[Neighbour, bool], None]
 ) -> Bus:
-    """Open a Zenoh router; raise BusError where that is not possible.
+    """Open a Zenoh router; raise BusError if that is not possible.
 
     values: Zenoh's configuration, by paths (``listen/endpoints``). on_neighbour: called on the event loop with every
     process that connects (True) or leaves (False).
@@ -105,17 +104,17 @@ async def open_router(
     return await open_zenoh_router(values, metrics, on_neighbour)
 
 
-def hear_zenoh(handler: Callable[[str], None]) -> None:
-    """Give ``handler`` the warnings that Zenoh prints, on a thread of its own. Call it once, before a bus is open."""
-    from zbridge.bus.zenoh import hear_log
+def read_zenoh_log(handler: Callable[[str], None]) -> None:
+    """Pass Zenoh's printed warnings to ``handler``, on a thread of its own. Call it once, before a bus is open."""
+    from zbridge.bus.zenoh import read_log
 
-    hear_log(handler)
+    read_log(handler)
 
 
 def read_key_expr(option: str, text: str) -> str:
     """Return a key expression in Zenoh's canonical form; raise ConfigError, which names the option and what is wrong.
 
-    Ask this before subscribing to what a person wrote: Zenoh's own error is no ZbridgeError.
+    Call this before subscribing to an expression that a person wrote: Zenoh's own error is no ZbridgeError.
     """
     from zbridge.bus.zenoh import canonical
 

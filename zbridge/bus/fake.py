@@ -1,6 +1,6 @@
 """A bus inside one process, for tests: the bus interface and Zenoh's key matching, without threads and delays.
 
-Handlers are called at once, by the caller of ``put`` or ``ask``. All that was put is kept, for the test to look at.
+Handlers are called at once, by the caller of ``put`` or ``ask``. All that was put is kept for the test to inspect.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ H = TypeVar("H", bound=Handle)
 
 @lru_cache(maxsize=65536)
 def meet(one: str, other: str) -> bool:
-    """Tell whether there is a key that both key expressions match."""
+    """Return whether there is a key that both key expressions match."""
     return _meet(one.split("/"), other.split("/"))
 
 
@@ -76,7 +76,7 @@ class FakeBus:
             handler(up)
 
     def relieve(self) -> None:
-        """Take messages again, and tell the sources that pause."""
+        """Accept messages again, and notify the paused sources."""
         self.takes = True
         for handler in tuple(self._relief):
             handler()
@@ -210,12 +210,12 @@ class FakeNetwork:
     def __init__(self) -> None:
         self.subscribers: list[tuple[str, Callable[[Sample], None]]] = []
         self.priorities: dict[str, PriorityClass | Sort] = {}
-        """What the last subscriber of each key expression gave; a fake bus itself sorts nothing."""
+        """The priority that the last subscriber of each key expression gave; a fake bus itself sorts nothing."""
         self.queryables: list[tuple[str, Callable[[IncomingQuery], None], str]] = []
         self.tokens: list[str] = []
         self.watchers: list[tuple[str, Callable[[str, bool], None]]] = []
         self.listened: list[tuple[str, Callable[[bool], None]]] = []
-        """The keys of those who ask whether anybody listens, and what to call when that changes."""
+        """The keys whose listeners are watched, and what to call when they change."""
         self.last: dict[str, bytes] = {}
         self.history: list[Sample] = []
 
@@ -268,7 +268,7 @@ class _FakePublisher(_FakeHandle):
 
 
 class FakeQuery:
-    """A query whose replies a test may look at."""
+    """A query whose replies a test may inspect."""
 
     def __init__(self, key: str, payload: bytes = b"", *, asked: str | None = None) -> None:
         self.key = key

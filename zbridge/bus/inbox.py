@@ -1,4 +1,4 @@
-"""Carries what Zenoh's threads bring to the event loop. Knows no zenoh.
+"""Carries input from Zenoh's threads to the event loop. Knows no zenoh.
 
 Theory of operation. Every subscription and every queryable has a :class:`Source`, with one bounded queue for each
 priority class it uses: a flood of one source fills no other's queue. Only COMMAND has one queue for all sources: the
@@ -51,7 +51,7 @@ class Inbox:
     def source(self, handler: Handler, read: Read | None = None) -> Source:
         """Make the source of one subscription or queryable.
 
-        read: makes of each item what the handler takes, on the event loop's thread; None: the handler takes the item.
+        read: converts each item for the handler, on the event loop's thread; None: the handler gets the item itself.
         """
         return Source(self, handler, read, self._dropped, self._folded)
 
@@ -90,7 +90,7 @@ class Inbox:
 
     def _serve_one(self, line: deque[_Queue]) -> None:
         queue = line.popleft()
-        queue.listed = False  # before the item is taken: a later item lists the queue anew
+        queue.listed = False  # before the item is taken: a later item lists the queue again
         try:
             source, raw = queue.take()
         except IndexError:  # the queue was listed twice, or its items were dropped
@@ -105,7 +105,7 @@ class Inbox:
 
 
 class Source:
-    """The entrance of one subscription or queryable."""
+    """The input of one subscription or queryable."""
 
     def __init__(self, inbox: Inbox, handler: Handler, read: Read | None, dropped: Count, folded: Count) -> None:
         self.handler = handler
@@ -124,7 +124,7 @@ class Source:
         return f"<Source {waiting or 'empty'}>"
 
     def put(self, raw: Any, priority: PriorityClass, size: int = 0) -> None:
-        """Queue an item of ``size`` bytes for the loop, from any thread; drop and count the oldest where it is full."""
+        """Queue an item of ``size`` bytes for the loop, from any thread; drop and count the oldest if it is full."""
         queue = self._queues[priority]
         while queue.items and (len(queue.items) >= QUEUE or queue.bytes + size > QUEUE_BYTES):
             queue.forget()
@@ -133,7 +133,7 @@ class Source:
         self._inbox.line_up(queue, priority)
 
     def fold(self, raw: Any, priority: PriorityClass) -> None:
-        """Queue an item unless one waits already: then both are the same, and the new one is counted."""
+        """Queue an item unless one already waits: both are the same, and the new one is counted."""
         queue = self._queues[priority]
         if queue.items:
             self._folded.value += 1
@@ -167,7 +167,7 @@ class _Queue:
             self._forgotten += self.items.popleft()[2]
 
     def take(self) -> tuple[Source, Any]:
-        """Take the oldest item, on the loop's thread; raise IndexError where there is none."""
+        """Take the oldest item, on the loop's thread; raise IndexError if there is none."""
         source, raw, size = self.items.popleft()
         self._taken += size
         return source, raw

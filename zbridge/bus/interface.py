@@ -17,14 +17,14 @@ Connection = Annotated[str, msgspec.Meta(pattern=r"^(tcp|udp|tls|quic|ws|unixsoc
 
 
 SECURE = ("tls", "quic")
-"""The kinds of endpoints at which certificates are shown."""
+"""The kinds of endpoints that use certificates."""
 _FULL = "transport/link/tx/queue/congestion_control"
 FULL_QUEUES = {f"{_FULL}/drop/wait_before_drop": 20_000, f"{_FULL}/block/wait_before_close": 1_000_000}
 """How long Zenoh waits for room in a full transmission queue, by the paths of its configuration, microseconds.
 
 Streams are dropped when the bus stalls, not when one of its threads is a millisecond late. Everything else closes the
-connection, which is made anew. While threads wait for that, Zenoh 1.10 may lock up: with its default, 5 s, one of six
-sessions never connected again after 4 of 33 cuts of the network (eclipse-zenoh/zenoh#1876); with 1 s, after 1 of 183.
+connection, which is then reopened. While threads wait for room, Zenoh 1.10 may lock up: with its default, 5 s, one of
+six sessions never reconnected after 4 of 33 cuts of the network (eclipse-zenoh/zenoh#1876); with 1 s, after 1 of 183.
 """
 
 
@@ -39,8 +39,8 @@ class Tls(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class BusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The ``[bus]`` table of a configuration.
 
-    With ``tls`` a session is a client of routers that it is told: peers with certificates find each other by gossip,
-    and would go round the router's rules in plain TCP. Anything else raises ConfigError.
+    With ``tls`` a session is a client of the routers in ``connect``: peers with certificates find each other by gossip,
+    and would bypass the router's rules in plain TCP. Anything else raises ConfigError.
     """
 
     mode: Literal["peer", "client", "router"] | None = None
@@ -74,7 +74,7 @@ class BusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def alone_is_normal(self) -> bool:
-        """Whether a session may be healthy without any connection: it waits for others, and is told of nobody."""
+        """Whether a session may be healthy without any connection: it only waits for others to connect."""
         return self.effective_mode != "client" and not self.connect
 
 
@@ -115,8 +115,8 @@ class IncomingQuery(Protocol):
 class Answer(msgspec.Struct, frozen=True):
     """One reply to a query of ours.
 
-    error: None, or why there is no payload: Refused as the replier refused, BusError for any other error reply.
-    replier: the id of the session that replied, as the bus says; None where it does not say.
+    error: None, or why there is no payload: Refused as the replier sent it, BusError for any other error reply.
+    replier: the id of the session that replied, as the bus reports it; None if unknown.
     """
 
     key: str
@@ -126,13 +126,13 @@ class Answer(msgspec.Struct, frozen=True):
 
 
 class Publisher(Protocol):
-    """Writes one key."""
+    """Publishes on one key."""
 
     key: str
 
     @property
     def last(self) -> bytes | None:
-        """The last value, where the key keeps it."""
+        """The last value, if the key keeps it."""
 
     def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
         """Publish with the key's delivery, without blocking; False asks to pause the source."""
@@ -155,7 +155,7 @@ Batch = Sequence[tuple[Publisher, list[bytes]]]
 class PriorityClass(IntEnum):
     """The order in which the event loop serves input; each class has a bound and a share of its own.
 
-    STOP: stops that are all the same: of a source only one waits. LATCH: stops that have an id; each is served.
+    STOP: identical stops; of each source only one waits. LATCH: stops that have an id; each is served.
     """
 
     STOP = 0
@@ -188,16 +188,16 @@ class Bus(Protocol):
     def share(self, metrics: Metrics) -> Bus:
         """Return a bus on the same session for one robot, with queues, bounds and declarations of its own.
 
-        Its ``close`` takes back what was declared on it, and leaves the session to the others.
+        Its ``close`` undeclares what was declared on it, and leaves the session to the others.
         """
 
     def publisher(self, key: str, topic: Topic, last: bytes | None = None) -> Publisher:
-        """Declare that ``key`` will be written. last: what another process published last, for keys that keep it."""
+        """Declare a publisher of ``key``. last: what another process published last, for keys that keep it."""
 
     def put_all(self, batch: Batch) -> bool:
         """Publish stream messages in order; False asks to pause the source until the relief handler is called.
 
-        The bus takes the lists over: the caller must not use them again.
+        The bus owns the lists from then on: the caller must not use them again.
         """
 
     def on_relief(self, handler: Callable[[], None]) -> None:
@@ -215,12 +215,12 @@ class Bus(Protocol):
     ) -> Handle:
         """Subscribe to ``key_expr``.
 
-        priority: of all samples, or a Sort that chooses it for each. history: ask for last values too.
-        kept: the frames that publishers have kept come too, those of publishers that appear later as well.
+        priority: of all samples, or a Sort that chooses it for each. history: query last values too.
+        kept: also receive the frames that publishers keep, including publishers that appear later.
         direct: the handler is called on one of Zenoh's threads, for streams without priority and history: it must be
         quick, and may put frames on another bus.
 
-        Of the samples that a Sort gives priority STOP only one waits at a time: those that follow are the same stop.
+        Of the samples that a Sort gives priority STOP only one waits at a time, because they are all the same stop.
         """
 
     def answer(
@@ -239,14 +239,14 @@ class Bus(Protocol):
     def gather(self, key_expr: str) -> Handle:
         """Declare one queryable, ``key_expr`` (``.../**``), for all keys below it that are answered from now on.
 
-        Whoever may answer for one of the keys only, as access rules say, must not gather.
+        A session that access rules permit to answer for some of the keys only must not gather.
         """
 
     async def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
         """Query ``key_expr`` and collect the replies of ``timeout_s`` seconds, bounded in number."""
 
     def attend(self) -> None:
-        """Serve the stops and the holder's commands that wait. To be called in the middle of long work."""
+        """Serve the stops and the holder's commands that wait. Call it in the middle of long work."""
 
     def announce(self, key: str) -> Handle:
         """Declare a liveliness token."""
@@ -263,16 +263,17 @@ class Bus(Protocol):
     async def drain(self, key_expr: str) -> None:
         """Wait until all that was published has left this process, streams too; ``key_expr``: a query for its answer.
 
-        The query has the lowest priority, so that all else goes before it. Waits for a second at most, raises BusError.
+        The query has the lowest priority, so that everything else is sent before it. Waits for a second at most; raises
+        BusError.
         """
 
     def frames(
         self, key: str, listened: Callable[[bool], None], *, best_effort: bool = False, kept: int = 0
     ) -> Publisher:
-        """Declare a key for raw frames; call ``listened`` when the first listener comes and the last one goes.
+        """Declare a key for raw frames; call ``listened`` when the first listener appears and the last one leaves.
 
-        best_effort: links may lose frames. kept: last frames that Zenoh's advanced subscribers get when they come late;
-        needs a bus with timestamps.
+        best_effort: links may lose frames. kept: last frames that late advanced subscribers of Zenoh get; needs a bus
+        with timestamps.
         """
 
     def watch_listeners(self, key: str, handler: Callable[[bool], None]) -> Handle:
@@ -282,4 +283,4 @@ class Bus(Protocol):
         """Call ``handler`` when the first connection to the bus is made (True) and the last one is lost (False)."""
 
     async def close(self) -> bool:
-        """Leave the bus; False where that hangs: its threads then end with the process."""
+        """Leave the bus; False if that hangs: its threads then end with the process."""

@@ -1,11 +1,11 @@
-"""A subscription to keys that keep their last value, which a late joiner has too. Knows no zenoh.
+"""A subscription to keys that keep their last value, which late joiners get too. Knows no zenoh.
 
-Theory of operation. Live values come by a plain subscription. The last values are asked for when the liveliness token
-of a robot's gateway is there: at the begin, and again whenever it comes back, since what was published while the two
-could not reach each other is lost. The token may arrive before the way for the question is there: a question without an
-answer is put again, a few times. A value that came live while its robot was being asked is newer than the answer;
-one that was on its way meanwhile comes twice. Where the bus comes back, many robots' tokens come at once, and many
-joiners see them: so few robots are asked at a time, and each joiner begins at another moment.
+Theory of operation. Live values come by a plain subscription. The last values are queried when the liveliness token
+of a robot's gateway exists: at the start, and again whenever it returns, because what was published while the two could
+not reach each other is lost. The token may arrive before the route for the query exists: a query without an answer is
+repeated a few times. A value that arrived live while its robot was being queried is newer than the answer; one that was
+in transit meanwhile arrives twice. When the bus returns, many robots' tokens appear at once, and many joiners see them:
+so few robots are queried at a time, and each joiner begins at another moment.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from zbridge.fleet.topics import gateways_of, of_robot, split_key
 log = logging.getLogger("zbridge.bus")
 
 ASK_AFTER_S = (0.0, 0.1, 0.4, 1.5)
-"""Seconds before each question."""
+"""Seconds before each query."""
 JITTER_S = 0.1
-"""Most seconds by which the questions to a robot begin later where others are asked already."""
+"""Most seconds by which the queries to a robot are delayed if others are being queried."""
 ASKED_AT_ONCE = 32
-"""Robots that are asked at the same time; the others wait."""
+"""Robots that are queried at the same time; the others wait."""
 ROBOTS = 20_000
-"""Robots that are asked, or wait to be asked."""
+"""Most robots that are queried, or wait to be queried."""
 LIVE_KEYS = 4096
-"""Keys of a robot that are noted as live while it is asked."""
+"""Most keys of a robot that are noted as live while it is queried."""
 
 
 class LateJoin:
-    """Gives ``handler`` the last values of all keys that an expression matches, and then the live ones.
+    """Passes ``handler`` the last values of all keys that an expression matches, and then the live ones.
 
     chance: 0 to 1.
     """
@@ -51,7 +51,7 @@ class LateJoin:
         self._asking: dict[str, asyncio.Task[None]] = {}
         self._room = asyncio.Semaphore(ASKED_AT_ONCE)
         self._live: dict[str, set[str]] = {}
-        """By the robot that is asked, the keys that came live since."""
+        """By the robot that is queried, the keys received live since."""
         self._subscription = bus.subscribe(key_expr, self._take)
         self._watch = bus.watch_alive(gateways_of(key_expr), self._on_gateway)
 
@@ -102,7 +102,7 @@ class LateJoin:
         self._asking.pop(robot, None)
 
     async def _asked_once(self, realm: str, robot: str, live: set[str]) -> bool:
-        """Ask one robot, and hand on what did not come live meanwhile; False where it did not answer."""
+        """Query one robot, and pass on what was not received live meanwhile; False if it did not answer."""
         with contextlib.suppress(BusError):
             replies = await self._bus.ask(of_robot(self._key_expr, realm, robot))
             answers = [reply for reply in replies if reply.error is None and reply.key.startswith(f"{realm}/{robot}/")]

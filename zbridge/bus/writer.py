@@ -1,10 +1,11 @@
 """A thread that makes the calls that may block, so that the event loop never does. Knows no zenoh.
 
 Theory of operation. :meth:`Writer.put` queues a call, in order and bounded by :data:`BACKLOG`; :meth:`Writer.replace`
-keeps one call for each key, the newest. The thread makes all calls by key, then one queued call, and begins anew. Where
-calls come faster than the thread makes them, a lossy writer drops the oldest and counts it; a ``lossless`` writer keeps
-all, and tells its callers to pause until half of the backlog is free. Waking a thread costs a message that comes alone
-more than the call itself: :meth:`Writer.put_at_once` makes a small call on the caller's thread while the bus takes all.
+keeps one call for each key, the newest. The thread makes all calls by key, then one queued call, and starts over. If
+calls are queued faster than the thread makes them, a lossy writer drops the oldest and counts it; a ``lossless`` writer
+keeps all, and asks its callers to pause until half of the backlog is free. For a single message, waking a thread costs
+more than the call itself: :meth:`Writer.put_at_once` makes a small call on the caller's thread while the bus accepts
+everything.
 """
 
 from __future__ import annotations
@@ -21,14 +22,14 @@ from zbridge.metrics import Metrics
 log = logging.getLogger("zbridge.bus")
 
 BACKLOG = 4096
-"""Bound of what waits: a message counts one, a state one more for every 256 bytes."""
+"""Most messages that wait: a message counts one, a state one more for every 256 bytes."""
 
 AT_ONCE = 4
 """Most messages of a call that is made on the caller's thread."""
 SLOW_S = 0.002
-"""A call that takes longer met a bus that is full."""
+"""A call that takes longer than this met a full bus, seconds."""
 WARY_S = 1.0
-"""Seconds after a slow call for which none is made on the caller's thread."""
+"""Seconds after a slow call during which none is made on the caller's thread."""
 
 Call = Callable[[], object]
 
@@ -76,7 +77,7 @@ class Writer:
     def put_at_once(self, call: Call, size: int) -> bool:
         """Make a lossy call now if it is small, nothing waits and the bus is not full; else queue it as :meth:`put`.
 
-        The calls of one key are to come from one thread, or their order is lost. A call blocks at most as long as Zenoh
+        The calls of one key must come from one thread, or their order is lost. A call blocks at most as long as Zenoh
         waits for room, and then not again for :data:`WARY_S`.
         """
         if self._lossless or self._backlog or size > AT_ONCE or self._stopping or time.monotonic() < self._wary_until:
@@ -135,7 +136,7 @@ class Writer:
                     return
 
     def _work(self) -> bool:
-        """Make all calls by key and the oldest queued call; False where there was none."""
+        """Make all calls by key and the oldest queued call; False if there was none."""
         with self._lock:
             latest = list(self._latest.values())
             self._latest.clear()

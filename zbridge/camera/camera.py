@@ -1,8 +1,8 @@
 """One robot's camera on the bus: fetches its stream while somebody watches, publishes the images, feeds the relay.
 
-Theory of operation. Two tasks. One waits until somebody watches (:class:`Demand`), fetches the stream until it ends or
-nobody has watched for two seconds, and tries again with a back-off. The other is the relay, if there is one. A fault is
-a condition that ``status`` shows while somebody watches. Whatever the camera does, the robot is served as ever.
+Theory of operation. There are two tasks. One waits until somebody watches (:class:`Demand`), fetches the stream until
+it ends or nobody has watched for two seconds, and retries with a back-off. The other is the relay, if there is one. A
+fault is a condition that ``status`` shows while somebody watches. The camera never affects serving the robot.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from zbridge.tasks import race
 log = logging.getLogger("zbridge.camera")
 
 STEADY_S = 10.0
-"""A stream that lasted so long was a good one: the next attempt comes soon."""
+"""A stream that lasted this long was good: the next attempt follows soon; seconds."""
 RETRY_S = 5.0
-"""Longest time between two attempts, but for jitter: less than the relay's clients wait for a picture."""
+"""Longest time between two attempts, without jitter: less than the relay's clients wait for a picture."""
 _CONDITION, _RELAY = "camera", "camera relay"
 
 
@@ -123,7 +123,7 @@ class Camera:
         return None
 
     def _receive(self, stream: MjpegReader, parts: list[MjpegPart]) -> None:
-        """Take the parts of one read, of which the newest counts."""
+        """Handle the parts of one read; the newest counts."""
         self._rejected.value += stream.rejected
         if not parts:
             return
@@ -137,7 +137,7 @@ class Camera:
             self._publish()
 
     def _publish(self) -> None:
-        """Publish the newest picture if it is due, else when it is."""
+        """Publish the newest picture as soon as it is due."""
         now = self._loop.time()
         due = self._pace.due(now)
         self._dropped.value += self._pace.dropped

@@ -1,15 +1,15 @@
-"""Who watches a camera: programs on the bus, and clients of the relay. Nothing is fetched for nobody."""
+"""Tracks who watches a camera: programs on the bus, and clients of the relay. Without them nothing is fetched."""
 
 from __future__ import annotations
 
 import asyncio
 
 LINGER_S = 2.0
-"""Seconds for which the stream is still fetched after the last one who watched has gone: many come back at once."""
+"""Seconds for which the stream is still fetched after the last watcher has left: many return at once."""
 
 
 class Demand:
-    """Knows whether anybody watches, and waits until somebody does or nobody does any more."""
+    """Knows whether anybody watches, and waits for the first watcher, or until the last one has left."""
 
     def __init__(self) -> None:
         self.listened = False
@@ -28,17 +28,17 @@ class Demand:
         return self.listened or self.clients > 0
 
     def listen(self, anybody: bool) -> None:
-        """Note that the first listener on the bus has come, or that the last one has gone."""
+        """Record that the first listener on the bus has appeared, or that the last one has left."""
         self.listened = anybody
         self._notify()
 
     def join(self) -> None:
-        """Note one more client of the relay; :meth:`leave` must follow."""
+        """Record one more client of the relay; :meth:`leave` must follow."""
         self.clients += 1
         self._notify()
 
     def leave(self) -> None:
-        """Note that a client of the relay has gone."""
+        """Record that a client of the relay has left."""
         self.clients -= 1
         self._notify()
 

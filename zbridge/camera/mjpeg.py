@@ -1,18 +1,18 @@
 """Reads a camera's answer to a GET: an HTTP head, then pictures as parts of ``multipart/x-mixed-replace``. Sans-IO.
 
-Theory of operation. :class:`MjpegReader` takes bytes as they come and gives whole parts. Its parser is a generator that
-yields where it needs more bytes: for the blank line after the HTTP head, the first delimiter after any preamble, and
-then for each part its delimiter and header, and so many bytes as Content-Length says, or, where no length came, all up
+Theory of operation. :class:`MjpegReader` accepts bytes in any cut and returns whole parts. Its parser is a generator
+that yields when it needs more bytes: for the blank line after the HTTP head, the first delimiter after any preamble,
+and then for each part its delimiter and header, and as many bytes as Content-Length says, or, without a length, all up
 to the next delimiter.
 
-Every step has a bound; beyond it, or where bytes contradict the form, ProtocolError is raised and the reader must not
-be used again. A part of a stated length is given as soon as its last byte has come if it ends as a JPEG does; else only
-after the delimiter that has to follow: a wrong length gives no broken picture.
+Every step has a bound; beyond it, or if bytes contradict the format, ProtocolError is raised and the reader must not be
+used again. A part with a stated length is returned as soon as its last byte has arrived if it ends as a JPEG does;
+otherwise only after the delimiter that must follow: a wrong length produces no broken picture.
 
-Cameras differ from RFC 2046: the parameter ``boundary`` may hold the dashes of the delimiter, no line break need stand
-before a delimiter or between it and the header, and lines may end with a bare LF.
+Cameras differ from RFC 2046: the parameter ``boundary`` may hold the dashes of the delimiter, the line break
+before a delimiter, or between it and the header, may be missing, and lines may end with a bare LF.
 
-``is_jpeg``, ``is_whole`` and ``jpeg_size`` say what a JPEG's bytes tell without being decoded.
+``is_jpeg``, ``is_whole`` and ``jpeg_size`` inspect a JPEG without decoding it.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 def is_jpeg(data: bytes) -> bool:
-    """Tell whether the bytes begin as a JPEG does."""
+    """Return whether the bytes begin as a JPEG does."""
     return data.startswith(START)
 
 
 def is_whole(data: bytes) -> bool:
-    """Tell whether the bytes end as a JPEG does."""
+    """Return whether the bytes end as a JPEG does."""
     return data[-64:].rstrip(b"\0\r\n").endswith(END)
 
 
 def jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """Return width and height in pixels as the frame header says; None where none stands among the first segments."""
+    """Return width and height in pixels as the frame header says; None if none stands among the first segments."""
     at = 2
     for _ in range(_SEGMENTS):
         if len(data) < at + 9 or data[at] != 0xFF:
@@ -64,11 +64,11 @@ def jpeg_size(data: bytes) -> tuple[int, int] | None:
 
 
 HEAD_BYTES = 16 * 1024
-"""Bound of the HTTP head, of what precedes the first part, and of a part's header."""
+"""Most bytes of the HTTP head, of what precedes the first part, and of a part's header."""
 PICTURE_BYTES = 4 * 1024 * 1024
-"""Bound of one picture."""
+"""Most bytes of one picture."""
 _BREAKS = 4
-"""Bytes of line breaks that may stand between a picture and the next delimiter."""
+"""Most bytes of line breaks between a picture and the next delimiter."""
 _BLANK = re.compile(rb"\r?\n\r?\n")
 _STATUS = re.compile(rb"HTTP/1\.[0-9] ([0-9]{3})[ \r\n]")
 _BOUNDARY = re.compile(rb';\s*boundary\s*=\s*(?:"([!#-~]{1,72})"|([!#-:<-~]{1,72}))', re.IGNORECASE)
@@ -84,9 +84,9 @@ class MjpegPart(msgspec.Struct, frozen=True):
 
 
 class MjpegReader:
-    """Cuts the pictures out of one camera's answer.
+    """Extracts the pictures from one camera's answer.
 
-    head: the HTTP head with its blank line, once it has come. boundary: as the head names it. ended: the camera said
+    head: the HTTP head with its blank line, once it has arrived. boundary: as the head names it. ended: the camera said
     that no part follows. rejected: parts that were no JPEG and were left out.
     """
 
@@ -102,7 +102,7 @@ class MjpegReader:
         return f"<MjpegReader {len(self._buffer)} bytes{' ended' if self.ended else ''}>"
 
     def receive(self, data: bytes) -> list[MjpegPart]:
-        """Take bytes; return the parts that are whole now. Raises ProtocolError."""
+        """Add bytes; return the parts that are complete now. Raises ProtocolError."""
         self._buffer += data
         next(self._parser, None)
         parts, self._parts = self._parts, []
@@ -197,14 +197,14 @@ class MjpegReader:
         return jpeg
 
     def _cut(self, count: int) -> bytes:
-        """Take so many bytes out of the buffer."""
+        """Remove this many bytes from the buffer."""
         cut = bytes(self._buffer[:count])
         del self._buffer[:count]
         return cut
 
 
 def _boundary(head: bytes) -> bytes:
-    """Read the boundary that an HTTP head names; raise ProtocolError where it promises no such stream."""
+    """Read the boundary that an HTTP head names; raise ProtocolError if it promises no such stream."""
     status = _STATUS.match(head)
     if status is None:
         raise ProtocolError("the answer is not HTTP")
@@ -225,7 +225,7 @@ def _boundary(head: bytes) -> bytes:
 
 
 def _fields(head: bytes) -> dict[bytes, bytes]:
-    """Read the fields of a head, names in small letters; the first of a name counts. Other lines are left out."""
+    """Read the fields of a head, names in lower case; the first of a name counts. Other lines are ignored."""
     fields: dict[bytes, bytes] = {}
     for line in head.split(b"\n"):
         name, colon, value = line.partition(b":")
@@ -235,7 +235,7 @@ def _fields(head: bytes) -> dict[bytes, bytes]:
 
 
 def _length(fields: dict[bytes, bytes]) -> int:
-    """Return the length of a part; -1 where its header states none."""
+    """Return the length of a part; -1 if its header states none."""
     text = fields.get(b"content-length")
     if text is None:
         return -1

@@ -1,4 +1,4 @@
-"""How much of a camera's stream is taken and passed on. Sans-IO: ``now`` is in seconds on any clock."""
+"""Limits how much of a camera's stream is read and forwarded. Sans-IO: ``now`` is in seconds on any clock."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from typing import Generic, TypeVar
 T = TypeVar("T")
 
 BYTES_S = 32 * 1024 * 1024
-"""Bytes a second that are read from a camera; one that sends more waits."""
+"""Most bytes a second that are read from a camera; one that sends more waits."""
 PICTURES_S = 240
-"""Pictures a second that are read from a camera; one that sends more waits."""
+"""Most pictures a second that are read from a camera; one that sends more waits."""
 
 
 class ReadBudget:
-    """Bounds what a camera costs: tells how long to read nothing after what was read. A second of it may be saved."""
+    """Bounds the cost of a camera: returns how long to pause after a read. Up to one second's worth accumulates."""
 
     def __init__(self) -> None:
         self._paid_until = 0.0
@@ -25,7 +25,7 @@ class ReadBudget:
 
 
 class Pace(Generic[T]):
-    """Passes on ``rate_hz`` items a second, the newest of those that wait. After :meth:`offer`, call :meth:`due`."""
+    """Forwards ``rate_hz`` items a second, the newest of those waiting. After :meth:`offer`, call :meth:`due`."""
 
     def __init__(self, rate_hz: float) -> None:
         self.dropped = 0
@@ -38,12 +38,12 @@ class Pace(Generic[T]):
         return f"<Pace {self._waiting is not None}, {self.dropped} dropped>"
 
     def offer(self, item: T) -> None:
-        """Take the newest item."""
+        """Offer the newest item."""
         self.dropped += self._waiting is not None
         self._waiting = item
 
     def due(self, now: float) -> T | None:
-        """Return the item that may be passed on now; None: nothing waits, or it is too early.
+        """Return the item that may be forwarded now; None: nothing waits, or it is too early.
 
         One item may be early by an interval: cameras are not regular.
         """
@@ -54,5 +54,5 @@ class Pace(Generic[T]):
         return item
 
     def deadline(self) -> float | None:
-        """Return when what waits is due; None: nothing waits."""
+        """Return when the waiting item is due; None: nothing waits."""
         return None if self._waiting is None else self._next_at

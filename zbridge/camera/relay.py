@@ -1,9 +1,9 @@
-"""Serves ``/stream.mjpg`` to HQ programs from the one stream that is fetched, as if this were the camera.
+"""Serves ``/stream.mjpg`` to HQ programs from the one fetched stream, as if it were the camera.
 
-Legacy programs read multipart naively. So they get what the camera itself wrote: its HTTP head, and of each picture
-the delimiter and header, byte for byte and in their order. Each client has a task of its own that sends the newest
-picture, waits until the socket has accepted it, and continues with the newest then: a slow client sees fewer pictures
-and delays nobody. Clients are accepted one by one, bounded in number; refused ones are closed at most 100 a second.
+Legacy programs read multipart naively. So they get what the camera itself wrote: its HTTP head, and the delimiter and
+header of each picture, byte for byte and in order. Each client has a task of its own that sends the newest picture,
+waits until the socket has accepted it, and then continues with the newest: a slow client gets fewer pictures and delays
+nobody. Clients are accepted one by one, bounded in number; refused ones are closed at most 100 a second.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Latest:
         self._came = asyncio.Event()
 
     def forget(self) -> None:
-        """Keep no picture: the stream has ended, and what it showed is old."""
+        """Drop the picture: the stream has ended."""
         self._shot = None
 
     async def after(self, number: int) -> Shot:
@@ -65,13 +65,13 @@ log = logging.getLogger("zbridge.camera")
 
 PATH = b"/stream.mjpg"
 REQUEST_S = 5.0
-"""Longest time for a client's request."""
+"""Longest time for a client's request, seconds."""
 AWAY_S = 10.0
-"""A client is closed when the camera has shown no picture for so long, as a camera that is gone would close it."""
+"""A client is closed when the camera has sent no picture for this long, as if the camera were gone; seconds."""
 SEND_S = 10.0
-"""Longest time in which a client must take one picture."""
+"""Longest time in which a client must accept one picture, seconds."""
 UNSENT_BYTES = 128 * 1024
-"""The kernel's buffer for a client (it doubles the number): what waits there is no longer the newest."""
+"""The kernel's buffer for a client (it doubles the number): pictures in it are no longer the newest."""
 _REFUSAL_S = 0.01
 _REQUEST_BYTES = 8192
 _NOT_FOUND = b"HTTP/1.0 404 Not Found\r\nContent-Length: 0\r\n\r\n"
@@ -79,7 +79,7 @@ _FORBIDDEN = b"HTTP/1.0 403 Forbidden\r\nContent-Length: 0\r\n\r\n"
 
 
 class Relay:
-    """Listens at ``address`` until cancelled. report: shows people why it does not listen; None: it does."""
+    """Listens at ``address`` until cancelled. report: called with the reason if it cannot listen; None: it listens."""
 
     def __init__(
         self,
@@ -106,7 +106,7 @@ class Relay:
         return f"<Relay {self._address}, {len(self._clients)} clients>"
 
     async def run(self) -> None:
-        """Accept clients until cancelled; where the address is not available, try again."""
+        """Accept clients until cancelled; retry if the address is not available."""
         backoff = Backoff()
         while True:
             try:
@@ -144,7 +144,7 @@ class Relay:
             self._clients.start(self._serve(client))
 
     async def _serve(self, client: socket.socket) -> None:
-        """Answer one client, and give it pictures until it goes or takes none."""
+        """Answer one client, and send it pictures until it leaves or stalls."""
         with contextlib.suppress(OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
             try:
                 client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, UNSENT_BYTES)
@@ -167,7 +167,7 @@ class Relay:
 
     async def _give(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Send pictures until the client ends the connection, or sends more than a request."""
-        writer.transport.set_write_buffer_limits(0)  # drain() returns when the socket has taken all
+        writer.transport.set_write_buffer_limits(0)  # drain() returns when the socket has accepted all
         self._demand.join()
         try:
             await race(self._send(writer), reader.read(1))
@@ -195,9 +195,9 @@ class Relay:
 
 
 def _refusal(request: bytes) -> bytes | None:
-    """Return the answer to a request that gets no stream; None where it gets one.
+    """Return the answer to a request that gets no stream; None if it gets one.
 
-    A page of a browser that reads across origins says so with ``Origin``; HQ programs have none.
+    A cross-origin web page sends ``Origin``; HQ programs do not.
     """
     line, _, fields = request.partition(b"\r\n")
     method, _, target = line.partition(b" ")

@@ -17,9 +17,9 @@ _TARGET = re.compile(r"[!-~]+")
 
 
 class CameraSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """``[camera]``: where the robot streams MJPEG, and who gets it.
+    """``[camera]``: where the robot streams MJPEG, and who receives it.
 
-    rate_hz: most images a second on the bus. stall_s: a stream that brings no picture for so long is ended. relay:
+    rate_hz: most images a second on the bus. stall_s: a stream without a picture for this long is ended. relay:
     host:port at which HQ programs find ``/stream.mjpg``; None: nowhere. clients: of the relay, most at a time. allow:
     networks that they may connect from; empty: all.
     """

@@ -1,8 +1,8 @@
 """Fetches one camera's stream by plain HTTP/1.0 over one connection. Knows no bus and no relay.
 
-HTTP/1.0 asks for the stream as it is: a server must not cut it into chunks. Redirects are not followed: a camera must
-not choose what else this machine asks. Plain sockets suffice for this, and every wait and buffer has a bound here; an
-HTTP library would add a dependency and hide them.
+HTTP/1.0 requests the stream unchanged: a server must not chunk it. Redirects are not followed: a camera must not choose
+what else this machine requests. Plain sockets suffice, and every wait and buffer has a bound here; an HTTP library
+would add a dependency and hide them.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ CONNECT_S = 5.0
 _READ_BYTES = 64 * 1024
 
 OnParts = Callable[[MjpegReader, list[MjpegPart]], None]
-"""Called with the parts of one read, of which there may be none; ``rejected`` counts those of this read left out."""
+"""Called with the parts of one read, perhaps none; ``rejected`` counts the parts of this read that were dropped."""
 
 
 async def fetch(source: CameraSource, stall_s: float, on_parts: OnParts) -> None:
-    """Fetch a stream and give its pictures until it ends, which always raises: LinkError or ProtocolError.
+    """Fetch a stream and pass on its pictures until it ends, which always raises LinkError or ProtocolError.
 
-    A stream that brings no whole picture for ``stall_s`` seconds is ended. One that sends more than a camera does is
-    read more slowly (:class:`ReadBudget`).
+    A stream without a whole picture for ``stall_s`` seconds is ended. One that sends more than a camera does is read
+    more slowly (:class:`ReadBudget`).
     """
     reader, writer = await _connect(source)
     try:
@@ -43,7 +43,7 @@ async def fetch(source: CameraSource, stall_s: float, on_parts: OnParts) -> None
 
 
 def explain(error: OSError) -> str:
-    """Say why in the operating system's words, on every event loop: ``Connection refused``."""
+    """Return the operating system's text of an error, on every event loop: ``Connection refused``."""
     known = error.errno is not None and error.errno > 0 and not isinstance(error, socket.gaierror)
     return os.strerror(error.errno) if known and error.errno is not None else error.strerror or str(error)
 

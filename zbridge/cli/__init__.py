@@ -6,8 +6,8 @@ unlatch, restart, certs, record, info, export, mark, replay, ros2``.
 Knows no protocol. Only this package imports typer and rich, and this module does not: ``zbridge run`` loads neither.
 ``app`` declares the commands; ``certs``, ``robot_commands`` and ``recording_commands`` declare groups of them. ``bus``,
 ``demo`` (with ``demo_bus``), ``drive``, ``gateway_commands``, ``probe``, ``recording``, ``router``, ``supervise`` and
-``viewers`` carry them out. ``keyboard`` turns keys into drives, ``fork_server`` is the process that gateways of
-``zbridge run DIR`` are forked from. Exit codes: 0 done, 1 failed, 2 wrong arguments or configuration; those of
+``viewers`` implement them. ``keyboard`` converts keys to drives; ``fork_server`` forks the gateways of
+``zbridge run DIR``. Exit codes: 0 done, 1 failed, 2 wrong arguments or configuration; those of
 ``health`` are for monitoring programs.
 """
 
@@ -35,7 +35,7 @@ from zbridge.host.together import Together
 from zbridge.security.member import check_member
 from zbridge.toml import prefixed, read_file
 
-if TYPE_CHECKING:  # loaded where there is a supervisor only
+if TYPE_CHECKING:  # loaded only under a supervisor
     from zbridge.app.config import GatewayPlan
     from zbridge.host.child import Reporter
 
@@ -85,8 +85,8 @@ def run_gateway(
     """Run the gateway of a configuration until SIGTERM or SIGINT, or until a successor has taken it over.
 
     content: of the file, if it was read already. tls: a folder, for a file without ``bus.tls``. take_over: the
-    descriptor of the channel to the gateway that hands everything over to this process. reporter: tells the supervisor,
-    where there is one, which also starts the successor then.
+    descriptor of the channel to the gateway that hands over to this process. reporter: reports to the supervisor, if
+    there is one, which then also starts successors.
     """
     if reporter is None:
         set_up_log(verbose=verbose)
@@ -94,7 +94,7 @@ def run_gateway(
     hand_on_tls(tls)
     with prefixed(f"{file}: "):
         _check(plan, only)
-    gc.freeze()  # objects made at start-up live as long as the process; the collector skips them
+    gc.freeze()  # objects made at start-up live as long as the process: exclude them from garbage collection
     predecessor = socket.socket(fileno=take_over) if take_over is not None else None
     successor = reporter if reporter is not None else Spawn(file, verbose=verbose)
     gateway = Gateway(plan, observer=reporter, predecessor=predecessor, successor=successor)
@@ -125,14 +125,14 @@ def _check(plan: GatewayPlan, only: str | None) -> None:
 
 
 def _exit(*, left: bool) -> None:
-    """End the process where the bus was not left: one of its threads hangs and would keep the process alive."""
+    """End the process if leaving the bus failed: one of its threads hangs, and would keep the process alive."""
     if not left:
         logging.shutdown()
         os._exit(0)
 
 
 def hand_on_tls(folder: Path | None) -> None:
-    """Let the processes that this one starts read certificates from the same folder."""
+    """Make child processes read certificates from the same folder."""
     if folder is not None:
         os.environ[TLS_VARIABLE] = str(folder.absolute())
 
@@ -170,7 +170,7 @@ def run_loop(work: Coroutine[Any, Any, Any]) -> Any:
 
 
 def run_command(work: Coroutine[Any, Any, bool | int | None], *, level: int = logging.ERROR) -> None:
-    """Log from ``level`` on, and run a coroutine; end the process with the code that it returns, False being 1."""
+    """Set up logging, and run a coroutine; end the process with the code that it returns, False being 1."""
     set_up_log(verbose=False, level=level)
     result = run_loop(work)
     code = int(not result) if isinstance(result, bool) else result
@@ -187,7 +187,7 @@ def set_up_log(*, verbose: bool, level: int = logging.INFO, robot: str = "") -> 
 
 
 class LineFormatter(logging.Formatter):
-    """Writes a record as one line that is safe to print, whatever peers sent; a traceback on lines below it."""
+    """Formats a record as one line that is safe to print, whatever peers sent; a traceback follows on further lines."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - the library's names
         return shown(super().formatMessage(record))

@@ -60,7 +60,7 @@ SimulatedAt = Annotated[
     ),
 ]
 ServedBy = Annotated[
-    str, typer.Option(help="be an HQ program instead, as fragile as legacy ones, and connect to this address")
+    str, typer.Option(help="simulate an HQ program instead, as fragile as a legacy one, and connect it to this address")
 ]
 Drives = Annotated[
     str, typer.Option(help="with --hq: drive FORWARD or FORWARD,TURN, fractions of full scale: 0.3 or 0.3,-0.2")
@@ -73,19 +73,19 @@ def run(
     together: Annotated[
         bool, typer.Option("--together", help="several robots in one process, as host.toml of a directory may say")
     ] = False,
-    watch: Annotated[bool, typer.Option("--watch", help="follow files that come, change or go")] = False,
+    watch: Annotated[bool, typer.Option("--watch", help="apply added, changed and removed files")] = False,
     tls: FileTls = None,
     verbose: Verbose = False,
-    take_over: Annotated[int, typer.Option("--take-over", help="descriptor of a gateway that goes", hidden=True)] = -1,
+    take_over: Annotated[int, typer.Option("--take-over", help="descriptor from the predecessor", hidden=True)] = -1,
 ) -> None:
-    """Run a gateway in the foreground until SIGTERM or SIGINT; of a directory or several files one process each.
+    """Run a gateway in the foreground until SIGTERM or SIGINT; for a directory or several files, one process per file.
 
-    SIGUSR2 restarts a gateway under way.
+    SIGUSR2 restarts a gateway without dropping its connections.
     """
     host = load_host(files[0]) if len(files) == 1 and files[0].is_dir() else HostSettings()
     if together or host.together:
         if watch:
-            give_up(2, "--watch: expected without --together: one process follows no files")
+            give_up(2, "--watch: not with --together, which does not follow files")
         hand_on_tls(tls)
         run_together(_robot_files(files), host, verbose=verbose)
     elif len(files) == 1 and not files[0].is_dir() and not watch:
@@ -153,11 +153,11 @@ def simulate(
     listen: SimulatedAt = [],
     hq: ServedBy = "",
     drive: Drives = "",
-    seed: Annotated[int, typer.Option(help="the same seed makes the same world")] = 1,
+    seed: Annotated[int, typer.Option(help="seed of the simulated world")] = 1,
     version: Annotated[str, typer.Option(help="version of the protocol; the newest common one by default")] = "",
     dialect: Annotated[str, typer.Option(help="dialect of the protocol, where it has several")] = "",
     udp: Annotated[bool, typer.Option("--udp", help="offer datagrams")] = False,
-    fragile: Annotated[bool, typer.Option("--fragile", help="be as fragile as legacy robots")] = False,
+    fragile: Annotated[bool, typer.Option("--fragile", help="be as fragile as a legacy robot")] = False,
     camera: Annotated[str, typer.Option(help="stream pictures too: HOST:PORT, for example 127.0.0.1:8000")] = "",
     verbose: Verbose = False,
 ) -> None:
@@ -165,11 +165,11 @@ def simulate(
     set_up_log(verbose=verbose)
     simulated = find_protocol(protocol)
     if listen and hq:
-        give_up(2, "give either --listen, to be a robot, or --hq, to be an HQ program")
+        give_up(2, "give either --listen (a robot) or --hq (an HQ program)")
     if camera and hq:
-        give_up(2, "--camera is a robot's: expected without --hq")
+        give_up(2, "--camera: not with --hq")
     if drive and not hq:
-        give_up(2, "--drive is an HQ program's: expected with --hq")
+        give_up(2, "--drive: only with --hq")
     if hq:
         program = HqSimulation(Address.parse(hq), version or None, dialect or None, udp, read_drive(drive))
         simulate_hq(simulated, program)
@@ -209,7 +209,7 @@ def read_drive(text: str) -> tuple[float, float] | None:
 
 
 async def simulate_robot(simulated: Protocol, simulation: Simulation, camera: str) -> None:
-    """Simulate a robot, and its camera where an address is given, until cancelled."""
+    """Simulate a robot, and its camera if an address is given, until cancelled."""
     if not camera:
         await simulated.simulate(simulation)
         return
@@ -241,7 +241,7 @@ def probe(
     tls: TlsFolder = None,
     realm: Realm = "fleet",
 ) -> None:
-    """Print what a device is: from its gateway on the bus, else, with --yes, by a handshake with it."""
+    """Print what a device is: as its gateway reports on the bus, or, with --yes, after a handshake with it."""
     from zbridge.cli.probe import probe as ask
 
     found = find_protocol(protocol)
@@ -252,7 +252,8 @@ def probe(
 def demo(
     seconds: Annotated[float, typer.Option(help="end after this many seconds; 0: run until interrupted")] = 0.0,
     secure: Annotated[
-        bool, typer.Option("--secure", help="on mutual TLS, with roles made on the fly; needs zbridge[certs]")
+        bool,
+        typer.Option("--secure", help="use mutual TLS with generated certificates; needs zbridge[certs]"),
     ] = False,
 ) -> None:
     """Show a simulated robot of each protocol, their gateways, a router and a live table; loopback only."""
@@ -282,7 +283,7 @@ def router(
         bool, typer.Option("--print-nftables", help="print nftables rules that limit new connections per address")
     ] = False,
 ) -> None:
-    """Run a Zenoh router in the foreground until SIGTERM or SIGINT: with tls, each member may do what its role may."""
+    """Run a Zenoh router in the foreground until SIGTERM or SIGINT; with tls, roles limit what members may do."""
     from zbridge.cli.router import run_router
 
     set_up_log(verbose=False)

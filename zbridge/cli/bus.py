@@ -33,7 +33,7 @@ from zbridge.metrics import Metrics
 _SHOWN = 8
 """Bytes of a value that are printed."""
 _TABLE = 180
-"""Characters of a line of a session table, at least, also where the terminal has fewer."""
+"""Least width of a session table, characters, also on narrower terminals."""
 _CELL = 200
 """Characters of a cell of a table, at most."""
 _MESSAGE = 20_000
@@ -43,7 +43,7 @@ _SESSION_COLUMNS = (
     *("by", "in", "out", "lost", "left out", "reason"),
 )
 _SUMMED_UP = 20
-"""Robots from which on a line below the table counts them."""
+"""From this number of robots on, a line below the table counts them."""
 _DEPTH = 32
 """Levels of nested maps and arrays that are printed."""
 
@@ -53,7 +53,7 @@ errors = Console(stderr=True, highlight=False, soft_wrap=True, markup=False, emo
 
 @contextlib.asynccontextmanager
 async def joined(settings: BusSettings, realm: str | None) -> AsyncIterator[Bus]:
-    """Open the bus while the context lasts; raise BusError. realm: where a router must know us; None: wherever."""
+    """Open the bus while the context lasts; raise BusError. realm: in which a router must know us; None: any."""
     bus = await open_bus(settings, Metrics(), wait_for_peers=True, realm=realm)
     try:
         yield bus
@@ -116,7 +116,7 @@ def cell(text: str) -> Text:
 
 
 def print_columns(rows: Sequence[tuple[str, ...]]) -> None:
-    """Print rows of equal length in columns. A table of rich costs a millisecond a row: it is for fewer rows."""
+    """Print rows of equal length in columns. A table of rich takes a millisecond per row."""
     cells = [[shown(text, _CELL) for text in row] for row in rows]
     widths = [max(map(cell_len, column)) for column in zip(*cells, strict=True)]
     for row in cells:
@@ -153,8 +153,8 @@ async def echo(
 ) -> bool:
     """Print the messages on a key, the last value of each state first. realm: None takes that of the key.
 
-    count, seconds: end after so many, 0 = never. Return False if ``seconds`` passed with fewer messages than ``count``,
-    or with none. Raise ConfigError for what is no key expression, or none of the realm.
+    count, seconds: end after this many, 0 = never. Return False if ``seconds`` passed with fewer messages than
+    ``count``, or with none. Raise ConfigError for an invalid key expression, or one of another realm.
     """
     key = read_key_expr("KEY", key)
     seen, done = 0, asyncio.Event()
@@ -181,7 +181,7 @@ async def echo(
 
 
 def _realm_of(key: str, realm: str | None) -> str | None:
-    """Return the realm of a key expression, None where it has several; raise ConfigError if it is not ``realm``."""
+    """Return the realm of a key expression, None if it has several; raise ConfigError if it is not ``realm``."""
     first = key.partition("/")[0]
     if realm is None:
         return first if is_name(first) else None
@@ -243,9 +243,9 @@ def _plain(value: Any, depth: int = _DEPTH) -> Any:
 
 
 _NAMED_ILL = 5
-"""Robots that the line names."""
+"""Most robots that the line names."""
 _REASON = 120
-"""Characters of a reason that the line shows."""
+"""Most characters of a reason in the line."""
 
 
 async def report_health(settings: BusSettings, realm: str, robot: str | None, *, as_json: bool) -> int:

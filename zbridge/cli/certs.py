@@ -1,6 +1,6 @@
 """``zbridge certs``: an authority, and the certificates of everyone who may use a secure bus.
 
-What needs the package ``cryptography``, an extra, is imported by the command that uses it.
+Modules that need the package ``cryptography``, an extra, are imported by the commands that use them.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ Force = Annotated[bool, typer.Option("--force", help="replace what exists")]
 
 RESTART = "Restart the router, which reads roles.toml when it starts. That loses the bus: every driven robot stops."
 _PRINT = 8
-"""Bytes of a fingerprint in a table; all of them with --json."""
+"""Bytes of a fingerprint shown in the table; --json shows all."""
 _WIDTH = 180
-"""Characters of a line of the table, at least, also where the terminal has fewer."""
+"""Least width of the table, characters, also on narrower terminals."""
 
 
 @app.command()
@@ -53,7 +53,7 @@ def init(
 
     made = authority.init(folder, now(), force=force)
     say(f"{folder.ca}: {made.common_name}, expires {made.expires:%Y-%m-%d}, {made.fingerprint}")
-    say(f"Keep {folder.ca_key} to yourself: whoever reads it can make a certificate for any name and any role.")
+    say(f"Keep {folder.ca_key} secret: its holder can issue a certificate for any name and role.")
     if load_roles(folder.roles).names:
         say("Names in roles.toml need certificates of this authority: zbridge certs renew --all")
 
@@ -86,7 +86,7 @@ def issue(
         raise ConfigError(f"--listeners: a gateway's; the role {role} has none")
     member = Member(role, tuple(robot or ()), listeners)
     issued = make(folder, CertificateRequest(name, member, tuple(host or ()), days), now(), force=force)
-    say_issued(folder, name, issued)
+    print_issued(folder, name, issued)
     if issued.replaced_until is not None:
         say(
             f"The certificate that it replaces is valid until {issued.replaced_until:%Y-%m-%d} all the same."
@@ -111,7 +111,7 @@ def renew(
     if bool(names) == every:
         raise ConfigError("name one NAME or more, or give --all")
     for name in names or load_roles(folder.roles).names:
-        say_issued(folder, name, authority.renew(folder, name, now(), days=days))
+        print_issued(folder, name, authority.renew(folder, name, now(), days=days))
     say("The key stays: carry the new certificate.pem and ca.pem to where the old ones are used, and restart there.")
 
 
@@ -135,12 +135,12 @@ def list_names(
 
 @app.command()
 def revoke(name: Name, directory: Directory = Path("certs")) -> None:
-    """Take a name out of roles.toml for good."""
+    """Remove a name from roles.toml for good."""
     folder = opened(directory)
     from zbridge.security.certs import authority
 
     gone = authority.revoke(folder, name)
-    say(f"{gone.common_name} is revoked. {name} is never issued again.")
+    say(f"{gone.common_name} is revoked, and {name} cannot be issued again.")
     if gone.until is not None:
         say(
             f"Its certificate is valid until {gone.until:%Y-%m-%d}: Zenoh has no revocation lists. A router lets it"
@@ -164,7 +164,7 @@ def bundle(
     ] = None,
     at: Annotated[
         Path | None,
-        typer.Option(help="where the folder will stand on the other machine; FOLDER by default", show_default=False),
+        typer.Option(help="path of the folder on the other machine; FOLDER by default", show_default=False),
     ] = None,
     directory: Directory = Path("certs"),
     force: Force = False,
@@ -179,14 +179,14 @@ def bundle(
 
 
 def opened(directory: Path, command: str = "zbridge certs") -> Folder:
-    """Return the folder of the authority; raise ConfigError where the package ``cryptography`` is missing."""
+    """Return the folder of the authority; raise ConfigError if the package ``cryptography`` is missing."""
     if importlib.util.find_spec("cryptography") is None:
         raise ConfigError(f"{command} needs the package cryptography: pip install 'zbridge[certs]'")
     return Folder(directory)
 
 
 def now() -> datetime:
-    """Return the time, to the second: certificates count no finer."""
+    """Return the time, to the second, as certificates have it."""
     return datetime.now(UTC).replace(microsecond=0)
 
 
@@ -195,7 +195,7 @@ def say(text: object) -> None:
     typer.echo(shown(text))
 
 
-def say_issued(folder: Folder, name: str, issued: Issued) -> None:
+def print_issued(folder: Folder, name: str, issued: Issued) -> None:
     """Print where a certificate is, and what it is."""
     say(f"{folder.of(name).folder}: {issued.common_name}, expires {issued.expires:%Y-%m-%d}, {issued.fingerprint}")
 

@@ -1,6 +1,6 @@
 """``zbridge demo``: a simulated robot of each protocol, their gateways, a router, a table. Loopback only.
 
-Here the bus is open to all of this machine, and its router embedded; ``demo_bus`` makes one with roles.
+Here the bus is open to this machine, and its router embedded; ``demo_bus`` makes a bus with roles.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ FIGURE: tuple[dict[str, float], ...] = ({"forward": 0.6}, {"turn": 0.5})
 FIGURE_S = 2.0
 """Seconds of each motion: the robots drive straight on, then turn, and so on."""
 PRIORITY = -1
-"""Below the default of 0: anybody else who asks for a robot gets it."""
+"""Below the default of 0: any other program that acquires a robot gets it."""
 _RATES = ("pose", "scan", "map", "sensor")
 _NO_DATA = (topics.STATUS.path, topics.CONTROL.path)
 
@@ -98,7 +98,7 @@ class LiveTable:
 async def run_demo(seconds: float, *, secure: bool = False) -> None:
     """Show the demo for ``seconds`` (0: until interrupted); raise ZbridgeError if a robot sent no data.
 
-    secure: on mutual TLS, with roles; raises ConfigError where no certificates can be made.
+    secure: on mutual TLS, with roles; raises ConfigError if no certificates can be made.
     """
     robots = {f"{name}1": name for name in protocol_names() if _is_whole(name)}
     watch = LiveTable(list(robots))
@@ -140,7 +140,7 @@ def _left_out(error: ZbridgeError) -> str:
 
 
 def _is_whole(name: str) -> bool:
-    """Tell whether a protocol can be loaded, and what its robots need is installed; print why it cannot be loaded."""
+    """Return whether a protocol can be loaded, and what its robots need is installed; print why it cannot be loaded."""
     try:
         return all(find_spec(module) is not None for module in find_protocol(name).requires)
     except ConfigError as error:
@@ -202,7 +202,7 @@ async def _robot(
 
 
 async def _show(fleet: Fleet, watch: LiveTable, seconds: float, how: list[str]) -> None:
-    """Say how to take part, draw the table, and drive each robot until somebody else does."""
+    """Print how to take part, draw the table, and drive each robot until somebody else does."""
     for line in how:
         print(line, flush=True)  # noqa: T201
     loop = asyncio.get_running_loop()
@@ -222,8 +222,8 @@ async def _show(fleet: Fleet, watch: LiveTable, seconds: float, how: list[str]) 
 async def wander(robot: Robot) -> None:
     """Drive straight on, turn, and so on, until somebody else takes the robot, or stops it.
 
-    If this program was paused meanwhile, the robot was stopped, and the program begins anew: with a neutral, or with a
-    new lease if the pause was longer than the lease. A robot that accepts no commands for now is waited for.
+    If this program was paused meanwhile, the robot was stopped, and the program starts over: with a neutral, or with a
+    new lease if the pause was longer than the lease. It waits for a robot that accepts no commands now.
     """
     with contextlib.suppress(Refused, BusError):
         while True:

@@ -1,7 +1,7 @@
 """The processes of ``zbridge demo``, and the bus of ``zbridge demo --secure``: a router, and temporary certificates.
 
-A viewer's session looks, an operator's drives, and each robot's gateway speaks for its robot alone. The folders of the
-members stay as long as the demo runs, for commands in another terminal.
+A viewer's session watches, an operator's drives, and each gateway answers for its robot only. The members' folders
+exist as long as the demo runs, for commands in another terminal.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from zbridge.metrics import Metrics
 from zbridge.security.roles import Member
 
 END_S = 3.0
-"""Longest time processes are given to end by themselves."""
+"""Longest wait for processes to end by themselves, seconds."""
 
 
 def free_port() -> int:
@@ -46,7 +46,7 @@ async def process(
 ) -> AsyncIterator[asyncio.subprocess.Process]:
     """Run a command of ``zbridge`` while the context lasts.
 
-    read: its standard output is a pipe. state: a folder of its own for what it keeps over a restart.
+    read: its standard output is a pipe. state: a folder for what it keeps over a restart.
     """
     own = {"STATE_DIRECTORY": str(state)} if state is not None else {}
     started = await asyncio.create_subprocess_exec(
@@ -113,7 +113,7 @@ async def secure_bus(folder: Path, log: IO[bytes], robots: list[str]) -> AsyncIt
         viewer = await stack.enter_async_context(_joined(folder / _VIEWER))
         operator = await stack.enter_async_context(_joined(folder / _OPERATOR))
         commands = (
-            f"zbridge ls --sessions --tls {folder / _VIEWER}     # a viewer: looks and stops, and drives nothing",
+            f"zbridge ls --sessions --tls {folder / _VIEWER}     # a viewer: may watch and stop, not drive",
             f"zbridge drive {robots[0]} --tls {folder / _READER}     # an operator",
         )
         fleet = Fleet(operator, REALM, _OPERATOR)

@@ -29,7 +29,7 @@ _HELP = """hold a key down to move, release it to stop
   space  STOP (whoever drives)       + -  speed                Enter  take the lease again     x  end"""
 
 
-class Session:
+class DriveRun:
     """One run of ``zbridge drive``: keys in, drives out, one line of state on the terminal."""
 
     def __init__(self, robot: Robot, speed: float, *, who: str | None, takeover: bool) -> None:
@@ -43,7 +43,7 @@ class Session:
         self._line = ""
 
     async def run(self) -> None:
-        """Drive until ``x``; a lost lease is taken again with Enter."""
+        """Drive until ``x``; Enter acquires a lost lease again."""
         print(_HELP, f"waiting for the gateway of {self._robot.name}", sep="\n")  # noqa: T201
         with _raw_keys(self._loop, self._take):
             self._pilot.take()
@@ -55,7 +55,7 @@ class Session:
                 await self._pilot.close()
 
     async def _obey_keys(self) -> bool:
-        """Carry out what was pressed; False: to end. Raises why the lease was not granted, or nothing can be sent."""
+        """Carry out the pressed keys; False: end. Raises the reason if the lease was not granted, or sending failed."""
         while not self._keys.empty():
             key, at = self._keys.get_nowait()
             if key == "x":
@@ -71,7 +71,7 @@ class Session:
         return True
 
     def _drive(self) -> None:
-        """Send the drive that the keys stand for; without the lease only note that no key is held."""
+        """Send the drive that the keys command; without the lease only note that no key is held."""
         command, held = self._keyboard.drive(self._loop.time()), self._pilot.stick.held
         if command.moving and not held:
             return
@@ -125,7 +125,7 @@ async def drive_robot(
     if not sys.stdin.isatty():
         raise ZbridgeError("drive needs a terminal to read keys from")
     async with connect(settings=settings, realm=realm) as fleet:
-        await Session(fleet[name], speed, who=who, takeover=takeover).run()
+        await DriveRun(fleet[name], speed, who=who, takeover=takeover).run()
     print()  # noqa: T201
 
 

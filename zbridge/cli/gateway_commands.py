@@ -20,7 +20,7 @@ from zbridge.fleet.printable import shown
 from zbridge.fleet.topics import KeySpace, is_name, split_key
 
 _NAMED = 20
-"""Robots of one finding that are named, at most."""
+"""Most robots that a finding names."""
 
 
 async def stop(settings: BusSettings, realm: str, robot: str | None, *, latch: bool, reason: str | None) -> bool:
@@ -46,7 +46,7 @@ async def unlatch(settings: BusSettings, realm: str, robot: str | None) -> bool:
 
 
 def _report(outcomes: Mapping[str, Outcome], done: str, realm: str, *, only: str | None = None) -> bool:
-    """Print what came of each robot, the reasons to stderr; return whether all is well."""
+    """Print the outcome for each robot, reasons to stderr; return whether all succeeded."""
     for error in outcomes.values():
         if error is not None:
             errors.print(shown(str(error)))
@@ -106,7 +106,7 @@ async def _robots(bus: Bus, realm: str) -> list[str]:
 
 
 async def _restart_one(bus: Bus, keys: KeySpace, who: str) -> str | None:
-    """Return why a gateway was not restarted, or the role that this program lacks; None where it was."""
+    """Return why a gateway was not restarted, or the role that this program lacks; None if it was."""
     try:
         answers = await bus.ask(keys.key(topics.RPC_RESTART(who).path), timeout_s=ANSWER_S)
     except BusError as error:

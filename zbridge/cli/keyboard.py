@@ -1,4 +1,4 @@
-"""Turns keys into drive commands: motion only while a key repeats. Knows no terminal; time is an argument."""
+"""Converts keys to drive commands: motion only while a key repeats. Knows no terminal; time is an argument."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ DRIVES = {
 }
 ARROWS = {"\x1b[A": "w", "\x1b[B": "s", "\x1b[D": "a", "\x1b[C": "d"}
 _KEYS = re.compile(r"\x1b\[[0-?]*[!-/]*[@-~]|\x1bO[A-Za-z]|\x1b[^\x1b \[]?|.", re.DOTALL)
-"""One key: a whole escape sequence, so that its letters do not count as keys, or one character.
+"""One key: one character, or a whole escape sequence, whose letters are no keys.
 
 A space is never part of a sequence: it stops the robot whatever precedes it.
 """
 
 
 def split_keys(text: str) -> list[str]:
-    """Split what a terminal sent into keys; arrows, three characters each, become their letters."""
+    """Split a terminal's input into keys; arrows, three characters each, become their letters."""
     keys = [ARROWS.get(key, key) for key in _KEYS.findall(text)]
     return [key for key in keys if not key.startswith("\x1b")]
 
@@ -40,7 +40,7 @@ def split_keys(text: str) -> list[str]:
 class Keyboard:
     """The command that the keys pressed so far stand for.
 
-    A single press moves nothing: a terminal that hangs sends no repetition.
+    A single press moves nothing: a terminal that hangs does not repeat it.
     """
 
     def __init__(self, speed: float) -> None:

@@ -22,7 +22,7 @@ from zbridge.protocol.session import State
 from zbridge.transport import Conversation, Link, connect
 
 PROBE_S = 15.0
-"""Longest time a handshake may take."""
+"""Time limit of a handshake, seconds."""
 WARNING = (
     "{address} has no gateway on the bus. Legacy robots give one usable connection per start of the robot program: "
     "probing uses it up, and the robot must be restarted before a gateway can connect. Give --yes to probe."
@@ -46,7 +46,7 @@ async def probe(settings: BusSettings, protocol: Protocol, address: DeviceAddres
 async def _served(settings: BusSettings, address: DeviceAddress, realm: str) -> tuple[str, Status] | None:
     """Return the robot and status of the gateway on the bus that is connected to the address; None without one.
 
-    Raises BusRefused where there is a bus that refuses us.
+    Raises BusRefused if there is a bus that rejects us.
     """
     try:
         async with joined(settings, realm) as bus:
@@ -57,7 +57,7 @@ async def _served(settings: BusSettings, address: DeviceAddress, realm: str) -> 
                 split = split_key(answer.key)
                 if split is not None and any(link.peer == str(address) for link in status.links):
                     return split[1], status
-    except BusRefused:  # whether the device has a gateway is not known: it must not be spoken to
+    except BusRefused:  # the device may have a gateway: do not contact it
         raise
     except BusError:
         pass

@@ -41,7 +41,7 @@ from zbridge.views.recording.tape import Tape, TapeSettings
 from zbridge.views.recording.wire_robot import WireLink
 
 _LOSSES = 20
-"""Keys with losses that are printed."""
+"""Most keys with losses that are printed."""
 _LEAST_BUFFER = 2**20
 _MARKS_NOT = ("viewer", "recorder")
 
@@ -90,7 +90,7 @@ def _metadata(options: RecordOptions) -> dict[str, dict[str, str]]:
 
 
 async def run_record(settings: BusSettings, options: RecordOptions) -> bool:
-    """Record until a signal, the end of the duration, or of the disk; False where the recording failed."""
+    """Record until a signal, the end of the duration, or of the disk; False if the recording failed."""
     if options.only not in (None, "fleet", "foxglove"):
         raise ConfigError(f"only = {options.only!r}: expected 'fleet' or 'foxglove'")
     if not is_name(options.realm):
@@ -148,7 +148,7 @@ def _report_end(recorder: Recorder, tape: Tape, seconds: float) -> None:
 
 
 async def put_mark(settings: BusSettings, realm: str, text: str, who: str | None) -> None:
-    """Put a mark on the bus; raise ConfigError for a role that may not: the router would drop it without a word."""
+    """Put a mark on the bus; raise ConfigError for a role that may not: the router would silently drop it."""
     if (role := own_role(settings.tls)) in _MARKS_NOT:
         raise ConfigError(f"a {role} may not mark: expected the certificate of an operator")
     async with joined(settings, realm) as bus:
@@ -158,7 +158,7 @@ async def put_mark(settings: BusSettings, realm: str, text: str, who: str | None
 def show_info(path: Path, *, as_json: bool) -> None:
     """Print what a recording holds."""
     summary = summarize(path)
-    if not summary.messages and summary.fault == "this is no MCAP file":
+    if not summary.messages and summary.fault == "not an MCAP file":
         raise ConfigError(f"{path}: {summary.fault}")
     if not as_json:
         _print_info(summary)
@@ -173,7 +173,7 @@ def _print_info(summary: Summary) -> None:
     began = _day(summary.begin_ns)
     console.print(shown(f"{summary.path}: {summary.size} bytes, {summary.messages} messages"))
     console.print(shown(f"from {began}, {summary.duration_s:.3f} s"))
-    console.print(shown("ended properly" if summary.fault is None else f"not ended properly: {summary.fault}"))
+    console.print(shown("complete" if summary.fault is None else f"incomplete: {summary.fault}"))
     console.print(shown(f"robots: {', '.join(summary.robots) or 'none'}"))
     for name, pairs in summary.metadata:
         console.print(shown(f"{name}: " + ", ".join(f"{key} {value}" for key, value in pairs.items() if value)))
@@ -202,10 +202,10 @@ def run_export(path: Path, output: Path | None, keys: str, since: str, until: st
     except OSError as error:
         raise ZbridgeError(f"{error.filename or output}: {error.strerror or error}") from error
     errors.print(
-        shown(f"{done.messages} messages to {output}, {done.files} files, {done.skipped} without a form there")
+        shown(f"{done.messages} messages to {output}, {done.files} files, {done.skipped} that cannot be represented")
     )
     if done.fault is not None:
-        errors.print(shown(f"the recording is not whole: {done.fault}"))
+        errors.print(shown(f"the recording is incomplete: {done.fault}"))
 
 
 class ReplayOptions(msgspec.Struct, frozen=True, kw_only=True):
@@ -251,12 +251,12 @@ async def run_replay(settings: BusSettings, options: ReplayOptions) -> None:
     others = f", {replay.left_out} left out (other robots, commands, queries, raw frames, pictures)"
     errors.print(shown(f"{replay.played} messages played{others if replay.left_out else ''}"))
     if replay.fault is not None:
-        errors.print(shown(f"the recording is not whole: {replay.fault}"))
+        errors.print(shown(f"the recording is incomplete: {replay.fault}"))
 
 
 @contextlib.contextmanager
 def _keys(player: Player) -> Iterator[None]:
-    """Let Enter pause and resume the player."""
+    """Make Enter pause and resume the player."""
     loop, stdin = asyncio.get_running_loop(), sys.stdin.fileno()
 
     def pressed() -> None:
@@ -281,7 +281,7 @@ def _keys(player: Player) -> Iterator[None]:
 
 
 async def run_wire(path: Path, protocol: str, listen: list[str], robots: list[str], speed: float, realm: str) -> None:
-    """Be the legacy robot until all was played, or a signal."""
+    """Act as the legacy robot until all is played, or a signal."""
     with prefixed("listen = ", LinkError):
         addresses = [Address.parse(text) for text in listen]
     found = find_protocol(protocol)
@@ -297,12 +297,12 @@ async def run_wire(path: Path, protocol: str, listen: list[str], robots: list[st
     ready = [lambda at, name=link.link: print(f"{name} listens at {at}", flush=True) for link in links]  # noqa: T201
     await until_signal(together(*(link.run(at, tell) for link, at, tell in zip(links, addresses, ready, strict=True))))
     for link in links:
-        less = f"; in {link.unanswered} conversations the gateway said less than then" if link.unanswered else ""
+        less = f"; in {link.unanswered} conversations the gateway sent less than recorded" if link.unanswered else ""
         errors.print(shown(f"{link.link}: {link.frames} frames{less}"))
 
 
 def _links(protocol: Protocol, count: int, recorded: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of the links of a robot with so many; raise ConfigError if the recording has other ones."""
+    """Return the names of this many links of a robot; raise ConfigError if the recording has others."""
     names = {
         number: protocol.robot(protocol.options(), number, Metrics()).link_names
         for number in range(1, protocol.links + 1)

@@ -26,10 +26,10 @@ NewNames = Annotated[
 ]
 HqListeners = Annotated[
     list[str] | None,
-    typer.Option(help="serve old HQ programs: PROTOCOL:PORT, PROTOCOL:HOST:PORT or a file with [[hq]]"),
+    typer.Option(help="serve HQ programs: PROTOCOL:PORT, PROTOCOL:HOST:PORT or a file with [[hq]]"),
 ]
 AsRobot = Annotated[
-    str, typer.Option("--as-robot", help="be the legacy robot itself, from its raw frames; the protocol's name")
+    str, typer.Option("--as-robot", help="act as the legacy robot, from its raw frames; the name of its protocol")
 ]
 Listen = Annotated[
     list[str] | None, typer.Option(help="where the legacy robot listens, tcp://host:port; once for each link")
@@ -46,14 +46,14 @@ def record(
     output: Annotated[Path, typer.Option("-o", "--output", help="the file to write (MCAP)", show_default=False)] = ...,  # type: ignore[assignment]
     everything: Annotated[bool, typer.Option("--all", help="every robot of the realm")] = False,
     keys: Annotated[str, typer.Option(help="a key expression instead of robots")] = "",
-    only: Annotated[str, typer.Option(help="fleet: messages as they were; foxglove: their pictures; else both")] = "",
+    only: Annotated[str, typer.Option(help="record only fleet messages (fleet) or Foxglove messages (foxglove)")] = "",
     wire: Annotated[bool, typer.Option("--wire", help="raw legacy frames too")] = False,
     split: Annotated[str, typer.Option(help="begin another file after this size or time: 1GB, 10min")] = "",
     keep: Annotated[int, typer.Option(help="keep the last N files; with --split", min=0)] = 0,
     duration: Annotated[str, typer.Option(help="end after this time: 90s, 10min, 1h")] = "",
     compression: Annotated[str, typer.Option(help="zstd, lz4 or none")] = "zstd",
     config: Configurations = None,
-    buffer: Annotated[str, typer.Option(help="how much may wait for a slow disk")] = "64MiB",
+    buffer: Annotated[str, typer.Option(help="size of the queue for a slow disk")] = "64MiB",
     connect: Connect = [],  # noqa: B006
     tls: TlsFolder = None,
     realm: Realm = "fleet",
@@ -87,7 +87,7 @@ def info(
     file: Recorded,
     json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
 ) -> None:
-    """Say what a recording holds: robots, keys, counts, rates, gaps, and whether it was cut off."""
+    """Print what a recording holds: robots, keys, counts, rates, gaps, and whether it was cut off."""
     from zbridge.cli.recording import show_info
 
     show_info(file, as_json=json)
@@ -116,7 +116,7 @@ def export(
 @app.command()
 def mark(
     text: Annotated[str, typer.Argument(help="what happened", show_default=False)],
-    who: Annotated[str, typer.Option(help="who says so; user@host by default")] = "",
+    who: Annotated[str, typer.Option(help="author of the mark; user@host by default")] = "",
     connect: Connect = [],  # noqa: B006
     tls: TlsFolder = None,
     realm: Realm = "fleet",
@@ -132,7 +132,7 @@ def replay(
     file: Recorded,
     robot: NewNames = None,
     speed: Annotated[float, typer.Option(help="seconds of the recording per second", min=0.01, max=1000.0)] = 1.0,
-    loop: Annotated[bool, typer.Option("--loop", help="begin anew at the end")] = False,
+    loop: Annotated[bool, typer.Option("--loop", help="start over at the end")] = False,
     since: Since = "",
     until: Until = "",
     pause: Annotated[bool, typer.Option("--pause", help="start paused; Enter resumes, and pauses again")] = False,
@@ -150,7 +150,7 @@ def replay(
         give_up(2, "--as-robot and --listen belong together")
     if as_robot:
         if hq or loop or pause or since or until:
-            give_up(2, "--as-robot replays a recording once and whole: no --hq, --loop, --pause, --from, --to")
+            give_up(2, "--as-robot replays the whole recording once: not with --hq, --loop, --pause, --from, --to")
         run_command(run_wire(file, as_robot, listen or [], robot or [], speed, realm), level=logging.WARNING)
         return
     options = ReplayOptions(

@@ -24,7 +24,7 @@ Recorded = Annotated[
 FullSpeeds = Annotated[list[str], typer.Option(help="m/s at full scale, NUMBER or ROBOT=NUMBER; 1 by default")]
 FullTurns = Annotated[list[str], typer.Option(help="rad/s at full scale, NUMBER or ROBOT=NUMBER; 1 by default")]
 DriverName = Annotated[
-    str, typer.Option(help="what drivers are called first: the name of the certificate, else foxglove")
+    str, typer.Option(help="prefix of the drivers' names; by default the name in the certificate, else foxglove")
 ]
 
 
@@ -43,7 +43,7 @@ def foxglove(
     speed_full_mps: FullSpeeds = [],
     turn_full_radps: FullTurns = [],
     who: DriverName = "",
-    viewers: Annotated[int, typer.Option(help="most viewers at a time", min=1, max=1000)] = 32,
+    viewers: Annotated[int, typer.Option(help="maximum number of viewers", min=1, max=1000)] = 32,
     metrics: Annotated[str, typer.Option(help="host:port at which Prometheus reads the counters")] = "",
     connect: Connect = [],
     tls: TlsFolder = None,
@@ -151,7 +151,7 @@ def stop(
     robot: Annotated[str, typer.Argument(help="the robot's name", show_default=False)] = "",
     everything: Annotated[bool, typer.Option("--all", help="every robot of the realm")] = False,
     latch: Annotated[bool, typer.Option("--latch", help="let nobody drive before zbridge unlatch")] = False,
-    reason: Annotated[str, typer.Option(help="shown to whoever wants to drive")] = "",
+    reason: Annotated[str, typer.Option(help="shown to everyone who tries to drive")] = "",
     connect: Connect = [],
     tls: TlsFolder = None,
     realm: Realm = "fleet",
@@ -197,11 +197,11 @@ def restart(
 @app.command()
 def ros2(
     file: Annotated[
-        Path | None, typer.Argument(help="settings (TOML): speeds, sizes, what the options say", show_default=False)
+        Path | None, typer.Argument(help="settings (TOML): speeds, sizes, option defaults", show_default=False)
     ] = None,
     domain: Annotated[int | None, typer.Option(help="ROS_DOMAIN_ID; 0 by default", show_default=False)] = None,
     robot: Annotated[list[str], typer.Option(help="show this robot only; once for each; all by default")] = [],
-    drive: Annotated[bool, typer.Option("--drive", help="let publishers on cmd_vel drive, and calls switch")] = False,
+    drive: Annotated[bool, typer.Option("--drive", help="let cmd_vel publishers drive, and services switch")] = False,
     distro: Annotated[
         str, typer.Option(help="humble, iron, jazzy, kilted or lyrical; jazzy by default", show_default=False)
     ] = "",

@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 
 from zbridge.app import until_signal
-from zbridge.bus import hear_zenoh
+from zbridge.bus import read_zenoh_log
 from zbridge.cli import run_loop
 from zbridge.errors import ConfigError
 from zbridge.security.router import Router, ZenohWarnings
@@ -50,5 +50,5 @@ def run_router(
         print(nftables(plan.settings), end="")  # noqa: T201
         return
     os.environ.setdefault("ZENOH_RUNTIME", RUNTIME)
-    hear_zenoh(ZenohWarnings().take)
+    read_zenoh_log(ZenohWarnings().take)
     run_loop(until_signal(Router(plan).run()))

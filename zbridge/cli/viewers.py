@@ -28,7 +28,7 @@ def run_foxglove(bus: BusSettings, realm: str, file: Path | None, given: dict[st
         from zbridge.views.foxglove import server
         from zbridge.views.foxglove.settings import FoxgloveOptions, plan
     except ImportError as error:
-        raise ConfigError(f"{error}: expected what `pip install 'zbridge[foxglove]'` installs") from error
+        raise ConfigError(f"{error}: install the extra: pip install 'zbridge[foxglove]'") from error
     gc.freeze()  # objects made at start-up live as long as the process; the collector skips them
     given["who"] = given["who"] or own_name(bus.tls) or "foxglove"
     options: FoxgloveOptions = FoxgloveOptions(**given)  # type: ignore[arg-type]

@@ -7,8 +7,8 @@
         async with robot.control() as drive:
             await drive(forward=0.3)
 
-Knows no protocol and no part of a gateway: only keys and fleet messages.
-:mod:`zbridge.client.blocking` is the same for programs without an event loop.
+Knows no protocol and no part of a gateway, only keys and fleet messages. :mod:`zbridge.client.blocking` is the same for
+programs without an event loop.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from zbridge.metrics import Metrics
 __all__ = ["LOCAL_ROUTER", "Driver", "Feed", "Fleet", "Robot", "StateFeed", "bus_settings", "connect"]
 
 LOCAL_ROUTER = "tcp/127.0.0.1:7447"
-"""The address at which a router on this machine is expected."""
+"""The default address of a router on this machine."""
 
 
 def bus_settings(endpoints: Sequence[str] = (), tls: Tls | Path | str | None = None) -> BusSettings:
-    """Return how a program joins the bus: by the given endpoints, else by multicast and the router on this machine.
+    """Return the bus settings of a program: the given endpoints, else multicast and the router on this machine.
 
-    tls: the files of this program's certificate, or a folder as ``zbridge certs bundle`` makes it, which names
-    endpoints too. Raises ConfigError where they do not go together.
+    tls: the files of this program's certificate, or a folder made by ``zbridge certs bundle``, which names
+    endpoints too. Raises ConfigError if they do not fit together.
     """
     if isinstance(tls, Path | str):
         return folder_settings(Path(tls), endpoints)
@@ -54,9 +54,9 @@ async def connect(
     """Join the bus for as long as the context lasts.
 
     endpoints: Zenoh endpoints, ``tcp/192.168.0.2:7447``; by default the local network and the router on this machine.
-    tls: for a secure bus, a folder as ``zbridge certs bundle`` makes it, whose endpoints are used if none are given; or
-    the files. settings: all settings of the bus, instead of ``endpoints`` and ``tls``.
-    Raises BusError if no given endpoint can be reached, or the router refuses this program: the text says why;
+    tls: for a secure bus, a folder made by ``zbridge certs bundle``, whose endpoints are used if none are given; or the
+    files. settings: all settings of the bus, instead of ``endpoints`` and ``tls``.
+    Raises BusError if no given endpoint can be reached, or the router rejects this program, with the reason;
     ConfigError if the certificate cannot be read.
     """
     if isinstance(endpoints, str):

@@ -123,7 +123,7 @@ class Fleet:
         return self._loop.run(self._fleet.stop(names, reason))
 
     def latch(self, names: Iterable[str] | None = None, reason: str | None = None) -> dict[str, Outcome]:
-        """Stop them, and let nobody drive them before they are released."""
+        """Stop them, and prevent driving until they are released."""
         return self._loop.run(self._fleet.latch(names, reason))
 
     def unlatch(self) -> dict[str, Outcome]:
@@ -189,7 +189,7 @@ class ControlFeed(StateFeed[Control]):
 
 
 class Robot:
-    """One robot: a feed for each key it publishes, questions, commands that need no lease, and the lease."""
+    """One robot: a feed for each key it publishes, queries, commands that need no lease, and the lease."""
 
     def __init__(self, loop: _Loop, robot: fleets.Robot) -> None:
         self._loop = loop
@@ -222,7 +222,7 @@ class Robot:
         return Feed(self._loop, self._robot.sensors)
 
     def raw(self, protocol: str) -> Feed[Raw]:
-        """Return the feed of the legacy messages that no fleet message can hold."""
+        """Return the feed of legacy messages that no fleet message represents."""
         return Feed(self._loop, self._robot.raw(protocol))
 
     def ask_pose(self) -> Pose:
@@ -238,7 +238,7 @@ class Robot:
         self._loop.run(self._robot.stop(reason))
 
     def latch(self, reason: str | None = None) -> None:
-        """Stop the robot, and let nobody drive it before it is released."""
+        """Stop the robot, and prevent driving until it is released."""
         self._loop.run(self._robot.latch(reason))
 
     def unlatch(self) -> tuple[Latch, ...]:
@@ -271,7 +271,7 @@ class Robot:
 
 
 class Driver:
-    """The lease of one robot: ``drive(forward=0.3)``, again and again, for motion lasts only ``deadman_s``."""
+    """The lease of one robot: call ``drive(forward=0.3)`` repeatedly: motion lasts only ``deadman_s``."""
 
     def __init__(self, loop: _Loop, holder: driver.Driver) -> None:
         self._loop = loop
@@ -292,7 +292,7 @@ class Driver:
         self._loop.run(self._driver(forward, left, turn, light=light))
 
     def during(self, seconds: float, forward: float = 0.0, left: float = 0.0, turn: float = 0.0) -> None:
-        """Drive for so many seconds, then send neutral."""
+        """Drive for ``seconds``, then send neutral."""
         self._loop.run(self._driver.during(seconds, forward, left, turn))
 
     def neutral(self) -> None:
@@ -308,7 +308,7 @@ class Driver:
         self._loop.run(self._driver.mode(mode))
 
     def raw(self, protocol: str, message_id: int, body: bytes = b"") -> None:
-        """Send a legacy message that no fleet message can hold."""
+        """Send a legacy message that no fleet message represents."""
         self._loop.run(self._driver.raw(protocol, message_id, body))
 
 

@@ -1,4 +1,4 @@
-"""The right to drive one robot as a program has it; a :class:`LeaseHolder` keeps the lease itself."""
+"""The right to drive one robot, as programs use it; a :class:`LeaseHolder` keeps the lease itself."""
 
 from __future__ import annotations
 
@@ -26,26 +26,26 @@ __all__ = ["RETRY_S", "Driver", "default_who"]
 REPEAT_S = 0.05
 """Seconds between the commands of :meth:`Driver.during`."""
 SETTLED_S = 0.15
-"""Seconds until ``control`` has shown what was refused before a neutral; a gateway shows it within 0.05."""
+"""Seconds until ``control`` has shown the refusals from before a neutral; a gateway shows them within 0.05 s."""
 _MOVING = ("drive", "mode", "motor/", "raw/")
-"""What the names of commands begin with that need the lease."""
+"""Prefixes of the names of commands that need the lease."""
 
 
 def default_who() -> str:
     """Return the name of this program, ``user@host``."""
     try:
         user = getpass.getuser()
-    except (KeyError, OSError):  # a user id without a name
+    except (KeyError, OSError):  # the user id has no name
         user = "somebody"
     return f"{user}@{socket.gethostname()}"
 
 
 class Driver:
-    """The lease of one robot: ``await drive(forward=0.3)``, again and again, for motion lasts only ``deadman_s``.
+    """The lease of one robot: call ``await drive(forward=0.3)`` repeatedly, because motion lasts only ``deadman_s``.
 
-    ``lost`` is set when the lease is lost; from then on every command raises LeaseLost, which says why, and who holds
-    the robot. A command that the gateway refused is raised as Refused by the next command: as NeutralFirst where the
-    robot was stopped, because the program was paused for example; then :meth:`neutral`, and begin anew.
+    ``lost`` is set when the lease is lost; from then on every command raises LeaseLost with the reason and the new
+    holder. If the gateway refused a command, the next command raises Refused: NeutralFirst if the robot was stopped,
+    for example because the program was paused; then call :meth:`neutral`, and start a new motion.
     """
 
     def __init__(
@@ -94,10 +94,10 @@ class Driver:
             if not -1.0 <= value <= 1.0:
                 raise ValueError(f"{name} = {value!r}: expected -1 to 1")
         await self._send(topics.CMD_DRIVE, Drive(forward=forward, left=left, turn=turn, light=light))
-        await asyncio.sleep(0)  # a program that drives in a loop must leave time to notice a loss
+        await asyncio.sleep(0)  # a program that drives in a loop must get a chance to notice a loss
 
     async def during(self, seconds: float, forward: float = 0.0, left: float = 0.0, turn: float = 0.0) -> None:
-        """Drive for so many seconds, then send neutral; raise as a call does."""
+        """Drive for ``seconds``, then send neutral; raise as a call does."""
         loop = asyncio.get_running_loop()
         end = loop.time() + seconds
         while (left_s := end - loop.time()) > 0:
@@ -106,14 +106,14 @@ class Driver:
         await self()
 
     async def neutral(self) -> None:
-        """Send neutral: the answer of a program to NeutralFirst, before it begins its motion anew.
+        """Send neutral: how a program answers NeutralFirst, before it starts a new motion.
 
         The gateway stops a robot whose driver was paused for longer than ``deadman_s``, and refuses motion until a
-        neutral: nothing moves because a program wakes up, only because it decides to. Refusals that come of motion sent
-        before are dropped for :data:`SETTLED_S`; a later one is raised by the next motion: answer it likewise. A robot
-        that is driven by motors takes ``motor(name, 0.0)`` as neutral. Raises LeaseLost, or Refused as a call does.
+        neutral: a program that wakes up must not move a robot before it decides to. Refusals of motion sent earlier are
+        dropped for :data:`SETTLED_S`; the next motion raises a later one: answer it in the same way. For a robot that
+        is driven by motors, ``motor(name, 0.0)`` is neutral. Raises LeaseLost, or Refused as a call does.
         """
-        for settled_s in (SETTLED_S, 0.0):  # twice: a bus that is full drops drives
+        for settled_s in (SETTLED_S, 0.0):  # twice: a full bus drops drives
             if isinstance(self._refusal, NeutralFirst):
                 self._refusal = None
             await self()
@@ -132,13 +132,13 @@ class Driver:
         await self._send(topics.CMD_MODE, Mode(mode))  # type: ignore[arg-type]
 
     async def raw(self, protocol: str, message_id: int, body: bytes = b"") -> None:
-        """Send a legacy message that no fleet message can hold."""
+        """Send a legacy message that no fleet message represents."""
         await self._send(topics.CMD_RAW(protocol), Raw(id=message_id, body=body))
 
     def now(self, drive: Drive) -> bool:
-        """Send a drive without waiting, for programs that are called back; raise as a call does.
+        """Send a drive without waiting, for callbacks; raise as a call does.
 
-        False: nothing was sent, for another command is on its way, which it must not overtake.
+        False: nothing was sent, because it must not overtake another command in transit.
         """
         if self._lock.locked():
             return False
@@ -164,7 +164,7 @@ class Driver:
         if self.loss is not None:
             loss = LeaseLost(str(self.loss), self.loss.code, holder=self.loss.holder)
             loss.expired = self.loss.expired
-            raise loss  # a new one each time: the traceback of a raised exception grows
+            raise loss  # a new exception each time: the traceback of a raised one grows
         refusal, self._refusal = self._refusal, None
         if refusal is not None and getattr(message, "moving", True):
             raise refusal
@@ -178,16 +178,16 @@ class Driver:
     # The lease
 
     async def acquire(self) -> None:
-        """Get the lease.
+        """Acquire the lease.
 
-        Raises Held if another program has it, Malformed if it cannot be asked for like this; after ``wait_s`` NotReady
-        or RateLimited if the gateway kept refusing so, BusError if none answered; BusRefused where that is because a
-        router knows this program by a role that may not drive.
+        Raises Held if another program has it, Malformed for an invalid request; after ``wait_s`` NotReady or
+        RateLimited if the gateway kept refusing so, BusError if none answered; BusRefused if a router knows this
+        program by a role that may not drive.
         """
         self._holder.announce()
         with contextlib.suppress(BusError, PayloadError):
             for answer in await self._bus.ask(self._keys.key(topics.CONTROL.path), timeout_s=0.3):
-                if answer.error is None:  # the refusals of an earlier program of this name are no news
+                if answer.error is None:  # ignore the refusals of an earlier program of this name
                     self._client.news.take(payloads.decode(Control, answer.payload))
                     break
         self._spawn(self._holder.keep())
@@ -202,7 +202,7 @@ class Driver:
             raise
 
     def read_control(self, sample: Sample) -> None:
-        """Take news from ``control``: the holder of the lease, and refusals of this program's commands."""
+        """Handle news from ``control``: the holder of the lease, and refusals of this program's commands."""
         try:
             control = payloads.decode(Control, sample.payload)
         except PayloadError:
@@ -242,7 +242,7 @@ class Driver:
                 self._granted.set_exception(self._denial(event))
 
     def _denial(self, event: LeaseEvent) -> Exception:
-        """Return what is raised for a lease that was not granted."""
+        """Return the exception for a lease that was not granted."""
         error = event.error
         if event.unanswered or error is None:
             return BusError(f"{self.robot}: no gateway answered within {self._wait_s:g} s")

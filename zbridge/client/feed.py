@@ -18,16 +18,16 @@ T = TypeVar("T")
 F = TypeVar("F", bound=FleetMessage)
 
 WAITING = 256
-"""Messages that may wait for an iterating program; a new one replaces the oldest, which is counted as lost."""
+"""Most messages that wait for an iterating program; a further one replaces the oldest, which is counted as lost."""
 WAITING_IMAGES = 2
-"""The same of a key with large messages."""
+"""The same for a key with large messages."""
 
 
 class Feed(Generic[T]):
     """The messages of one key, or of several: ``async for message in feed``. Each iteration has a queue of its own.
 
     lost: messages that were dropped because the program was slower than the robot. malformed: payloads that could not
-    be decoded as their key's message; they are left out.
+    be decoded as their key's message; they are skipped.
     """
 
     def __init__(

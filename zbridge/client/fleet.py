@@ -1,4 +1,4 @@
-"""The robots on the bus, for programs that see and drive them."""
+"""The robots on the bus, for programs that watch and drive them."""
 
 from __future__ import annotations
 
@@ -52,15 +52,15 @@ SETTLE_S = 3.0
 ANSWER_S = 5.0
 """Longest wait for a robot's answer, seconds."""
 _attempts = itertools.count(1)
-"""Numbers the requests for a lease. Each has a liveliness token of its own: a gateway may learn of the end of the token
-of an earlier request only after it has granted a later one, which must not end for it."""
+"""Numbers the requests for a lease. Each has its own liveliness token: a gateway may learn that an earlier one's token
+is gone only after it has granted a later request, whose lease must not end for that."""
 
 
 class Fleet:
     """All robots of one realm: ``fleet["r1"]``. name: of this program on a secure bus, as its certificate says.
 
     clock_ms: the raw clock, which dates commands. attempts: numbers the requests for a lease of this bus session.
-    secret: returns so many random bytes.
+    secret: returns the given number of random bytes.
     """
 
     def __init__(
@@ -91,8 +91,8 @@ class Fleet:
     async def robots(self) -> dict[str, Status | None]:
         """Return the robots that have a gateway or a status, by name; None for a robot without a status.
 
-        While gateways come to the bus, or come back, an answer may be partial: it is asked for again until two in a row
-        name the same robots with a status each, within three seconds.
+        While gateways join or rejoin the bus, a result may be partial: the query is repeated until two results in a row
+        name the same robots with a status each, for at most three seconds.
         """
         robots = await settled(self._query_robots, lambda seen: seen.keys() if all(seen.values()) else None)
         return dict(sorted(robots.items()))
@@ -123,7 +123,7 @@ class Fleet:
     async def sessions(self) -> dict[tuple[str, str], tuple[SessionEntry, ...]]:
         """Return the session tables by robot and process: peers, their states, and what was not translated.
 
-        Asked for again as :meth:`robots` is.
+        The query is repeated as that of :meth:`robots` is.
         """
         tables = await settled(self._query_sessions, lambda seen: seen.keys())
         return dict(sorted(tables.items()))
@@ -141,15 +141,15 @@ class Fleet:
     async def stop(self, names: Iterable[str] | None = None, reason: str | None = None) -> dict[str, Outcome]:
         """Stop these robots, or all that have a gateway; return for each the error, None if the stop was confirmed.
 
-        All are stopped by one message at once, before each is stopped, and asked for its confirmation, by name.
+        One message stops all at once; then each is stopped by name, and has to confirm it.
         """
         return await self._stop(names, reason, latch=False)
 
     async def latch(self, names: Iterable[str] | None = None, reason: str | None = None) -> dict[str, Outcome]:
-        """Stop them as :meth:`stop` does, and let nobody drive them before they are released.
+        """Stop them as :meth:`stop` does, and prevent driving until they are released.
 
-        The stop of all robots is one of the whole fleet: gateways that come later learn of it, and :meth:`unlatch`
-        releases it. Robots that are named are released each by :meth:`Robot.unlatch`.
+        A stop of all robots latches the whole fleet: gateways that start later learn of it, and :meth:`unlatch`
+        releases it. Named robots are released one by one with :meth:`Robot.unlatch`.
         """
         return await self._stop(names, reason, latch=True)
 
@@ -208,7 +208,8 @@ class ControlFeed(StateFeed[Control]):
         priority: a program with a higher priority is given the robot of one with a lower priority.
         deadman_s: motion that is not repeated within this time ends; the robot's configuration caps it.
         takeover: take the robot from its holder. wait_s: longest wait for the robot's gateway, seconds.
-        Raises Held with the holder's name, BusError if nobody answers or the role lacks, or Refused as the gateway did.
+        Raises Held with the holder's name, BusError if nobody answers or the role is missing, or Refused as the gateway
+        did.
         """
         who, name = _lease_identity(who, name, self._own)
         request = Acquire(
@@ -229,7 +230,7 @@ class ControlFeed(StateFeed[Control]):
 
 
 def _lease_identity(who: str | None, name: str | None, certified: str | None) -> tuple[str, str]:
-    """Return the name that people are shown, and the one in the keys of the lease.
+    """Return the name that is shown to people, and the one in the keys of the lease.
 
     certified: the name in the certificate, if there is one. Raises Malformed if it does not allow the others.
     """
@@ -248,7 +249,7 @@ def _lease_identity(who: str | None, name: str | None, certified: str | None) ->
 
 
 class Robot:
-    """One robot: a feed for each key it publishes, questions, commands that need no lease, and the lease."""
+    """One robot: a feed for each key it publishes, queries, commands that need no lease, and the lease."""
 
     def __init__(
         self,
@@ -295,10 +296,10 @@ class Robot:
         return Feed(self._bus, self._keys.key("sensor/*"), read)
 
     def raw(self, protocol: str) -> Feed[Raw]:
-        """Return the feed of the legacy messages that no fleet message can hold."""
+        """Return the feed of legacy messages that no fleet message represents."""
         return self._feed(topics.RAW(protocol))
 
-    # Questions
+    # Queries
 
     async def ask_pose(self) -> Pose:
         """Ask the robot for its pose now; raise Refused with the gateway's reason, BusError if no gateway answers."""
@@ -320,7 +321,7 @@ class Robot:
         await self._stop(reason, latch=False)
 
     async def latch(self, reason: str | None = None) -> None:
-        """Stop the robot as :meth:`stop` does, and let nobody drive it before :meth:`unlatch`."""
+        """Stop the robot as :meth:`stop` does, and prevent driving until :meth:`unlatch`."""
         await self._stop(reason, latch=True)
 
     async def _stop(self, reason: str | None, *, latch: bool) -> None:
@@ -330,7 +331,7 @@ class Robot:
     async def unlatch(self) -> tuple[Latch, ...]:
         """Release the latched stops of this robot; return those that were in force.
 
-        Raises BusError if no gateway answers, Refused as the gateway did; Unsupported where the whole fleet is latched.
+        Raises BusError if no gateway answers, Refused as the gateway did; Unsupported if the whole fleet is latched.
         """
         return await stops.unlatch_robot(self._bus, self._keys, self._own)
 
@@ -381,8 +382,8 @@ class Robot:
 async def settled(query: Callable[[], Awaitable[T]], compared: Callable[[T], object]) -> T:
     """Query until two results in a row are the same, for at most :data:`SETTLE_S` seconds; return the last.
 
-    Results may be partial for a while, as when many gateways join the bus at once. compared: returns the part of a
-    result that must be the same, or None if the result is known to be partial.
+    Results may be partial for a while, for example when many gateways join the bus at once. compared: returns the part
+    of a result that must be the same, or None if the result is known to be partial.
     """
     loop = asyncio.get_running_loop()
     end, found = loop.time() + SETTLE_S, await query()

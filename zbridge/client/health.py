@@ -1,7 +1,7 @@
-"""How robots are, as monitoring asks: ok, warning or critical, with the reason.
+"""The health of robots for monitoring: ok, warning or critical, with the reason.
 
-A status that is answered by the bus's last value may be old: a gateway publishes its own once a second, and one that
-arrived while somebody subscribed shows that the gateway's event loop turns.
+A status that was queried as the last value may be old. A gateway publishes its status once a second: one that arrives
+live shows that the gateway's event loop runs.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from zbridge.fleet.printable import shown
 LISTEN_S = 3.0
 """Seconds in which a gateway must publish its status: it does so once a second."""
 _NAMED = 3
-"""Other robots that a reason names."""
+"""Most other robots that a reason names."""
 _PEER = 80
-"""Characters of an address that a reason shows."""
+"""Most characters of an address in a reason."""
 
 
 class HealthLevel(IntEnum):
@@ -34,7 +34,7 @@ class HealthLevel(IntEnum):
 
 
 class Health(msgspec.Struct, frozen=True):
-    """How one robot is. reason: what is wrong, or was noticed."""
+    """The health of one robot. reason: what is wrong, or was noticed."""
 
     level: HealthLevel
     state: str | None = None
@@ -48,16 +48,16 @@ def judge(status: Status | None, *, fresh: bool) -> Health:
         return Health(HealthLevel.CRITICAL, reason="no gateway serves it")
     level, reason = _LEVELS.get(status.state, HealthLevel.CRITICAL), status.reason
     if not fresh:
-        level, reason = HealthLevel.CRITICAL, f"its gateway has said nothing for {LISTEN_S:g} s"
+        level, reason = HealthLevel.CRITICAL, f"its gateway has published nothing for {LISTEN_S:g} s"
     elif level is HealthLevel.OK and reason:
         level = HealthLevel.WARNING
     return Health(level, status.state, reason, status.host)
 
 
 def same_addresses(statuses: Mapping[str, Status]) -> dict[str, str]:
-    """Say of each robot which other ones name the same address of a robot, and do not say that they share it.
+    """Return for each robot which others name the same robot address without declaring it shared.
 
-    Addresses of one machine only (loopback, serial lines) are left out. In two networks one address may be two robots.
+    Addresses of one machine only (loopback, serial lines) are ignored. In two networks one address may be two robots.
     """
     named: dict[str, list[str]] = {}
     for robot, status in sorted(statuses.items()):

@@ -1,13 +1,13 @@
-"""Drives one robot by one stick: acquires the lease, sends what the stick says, and releases. Knows no device.
+"""Drives one robot by one stick: acquires the lease, sends the stick's commands, and releases it. Knows no device.
 
-Theory of operation. The stick (:mod:`zbridge.lease.stick`) decides, and the pilot carries out. A task holds the lease
+Theory of operation. The stick (:mod:`zbridge.lease.stick`) decides, and the pilot acts. A task holds the lease
 from ACQUIRE on; it ends with the lease. While the lease is held, a drive is sent within :meth:`Pilot.drive`. The newest
-drive waits for the lease, or for a mode that is on its way, and for :data:`STALE_S` at most. A timer serves the stick's
+drive waits for the lease, or for a mode in transit, for at most :data:`STALE_S`. A timer serves the stick's
 deadlines.
 
 A lease that ends without :meth:`Pilot.release` is reported once, and the stick then needs neutral. A refused command
-ends the lease where the stick's rules say so; else :meth:`Pilot.drive` raises the refusal. Nothing is asked twice at
-the same time: a task waits until the one before it has released its lease.
+ends the lease if the stick's rules say so; otherwise :meth:`Pilot.drive` raises the refusal. Only one request for the
+lease runs at a time: a task waits until the previous one has released its lease.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from zbridge.fleet.messages import Drive
 from zbridge.lease.stick import Stick, StickAction
 
 STALE_S = 0.4
-"""Seconds after which a drive is not sent any more that waits for the lease."""
+"""Seconds after which a drive that waits for the lease is dropped."""
 MODES = 8
-"""Modes that may be on their way; one more is refused."""
+"""Most modes in transit; one more is refused."""
 _RELEASED = "the robot was released"
 
 
 class Pilot:
     """Drives one robot for one user. All calls belong on the event loop's thread.
 
-    control: asks for the lease, as :meth:`zbridge.client.Robot.control` does. on_end: called when the lease, or the
-    wait for it, ends, with the reason; None: it was released. turn: shared by pilots of which one after the other may
-    ask.
+    control: acquires the lease, as :meth:`zbridge.client.Robot.control` does. on_end: called when the lease, or the
+    wait for it, ends, with the reason; None: it was released. turn: shared by pilots that may acquire only one after
+    another.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class Pilot:
         self._arm()
 
     def take(self) -> None:
-        """Get the lease without motion; it must be released, unless the stick's rules say when."""
+        """Acquire the lease without motion; release it, unless the stick's rules do."""
         if self.stick.want(self._loop.time()) is StickAction.ACQUIRE:
             self._begin()
 
@@ -111,12 +111,12 @@ class Pilot:
         self._send_waiting()
 
     def require_neutral(self, why: str) -> None:
-        """Withdraw what waits; the stick must be centred once, for it was deflected before this."""
+        """Drop the waiting drive; the stick must be centred once, because it may still be deflected."""
         self._waiting = None
         self.stick.refused(why)
 
     def release(self) -> None:
-        """Release the lease, or stop asking for it; a moving robot is stopped. Idempotent."""
+        """Release the lease, or stop acquiring it; a moving robot is stopped. Idempotent."""
         if self.stick.active:
             self._end(None)
 
@@ -151,7 +151,7 @@ class Pilot:
                 self._end(error)
 
     def _end(self, error: Exception | None) -> None:
-        """Note that there is no lease any more, and why."""
+        """Record the end of the lease, and why."""
         task, self._task = self._task, None
         if task is not None and task is not asyncio.current_task():
             task.cancel()
@@ -188,7 +188,7 @@ class Pilot:
                 raise
 
     def _outlasts(self, error: Exception) -> bool:
-        """End the lease, unless it outlasts what became of a command; return whether it does."""
+        """End the lease, unless the rules keep it after this error; return whether they do."""
         if isinstance(error, LeaseLost) or not isinstance(error, Refused) or not self.stick.rules.keeps:
             self._end(error)
             return False
@@ -203,7 +203,7 @@ class Pilot:
             self.release()
 
     def _arm(self) -> None:
-        """Wake at the stick's deadline, or before it: drives mostly put it off."""
+        """Wake at the stick's deadline, or before it: most drives postpone it."""
         deadline = self.stick.deadline()
         if self._timer is not None and self._timer.when() > deadline:
             self._timer.cancel()

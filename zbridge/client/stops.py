@@ -1,7 +1,7 @@
-"""Stops robots, latches them, and releases them: what is reported is what their gateways confirmed.
+"""Stops, latches and releases robots; reports only what their gateways confirmed.
 
-A stop has an id of its own, and is repeated until ``control`` shows that id: whatever the network loses or delays, a
-confirmed stop was carried out by the robot's gateway. A robot's latched stop is released by its id; a stop of the whole
+Each stop has its own id, and is repeated until ``control`` shows that id: whatever the network loses or delays, the
+robot's gateway has carried out a confirmed stop. A robot's latched stop is released by its id; a stop of the whole
 fleet has one id for all robots.
 Source: the design's "Latched stop".
 """
@@ -31,23 +31,23 @@ CONFIRM_S = 3.0
 ANSWER_S = 2.0
 """Longest wait for the answer to a release."""
 AT_ONCE = 64
-"""Robots whose confirmation is waited for at a time."""
+"""Most robots whose confirmations are awaited at a time."""
 _ASK_S = 0.3
 _APART_S = 0.1
-"""Seconds after which a repeated stop is no repetition for a gateway."""
+"""Seconds after which a gateway does not treat a repeated stop as a repetition."""
 _WHO, _REASON = 64, 100
-"""Characters that fit the bound of a stop, with room for others than ASCII."""
+"""Characters that fit into a stop, with room for non-ASCII ones."""
 
 T = TypeVar("T")
 
 Outcome = Refused | BusError | None
-"""What came of a robot: None if it was confirmed."""
+"""The outcome for a robot: None if it was confirmed."""
 
 
 def new_stop(who: str, reason: str | None, *, latch: bool, secret: Callable[[int], bytes] = os.urandom) -> Stop:
-    """Make a stop with an id of its own. who, reason: for people, cut to what a stop can carry.
+    """Make a stop with its own id. who, reason: for people, truncated to what a stop can carry.
 
-    secret: returns so many random bytes.
+    secret: returns the given number of random bytes.
     """
     stop = Stop(id=secret(16), who=_cut(who, _WHO))
     if latch:
@@ -67,13 +67,13 @@ async def stop_robot(bus: Bus, keys: KeySpace, stop: Stop) -> None:
     """Stop a robot and return when its gateway has confirmed it.
 
     Raises BusError if no gateway does within CONFIRM_S, Refused if the robot cannot be stopped, NotReady if its gateway
-    has no connection to it, or one that takes nothing.
+    has no connection to it, or a stalled one.
     """
     await put_stop(bus, keys, stop)  # before anything that may take time
     control = await _shown(bus, keys, stop, lambda control: stop.id in control.stops, CONFIRM_S)
     if control is None:
         raise BusError(f"{keys.robot}: stop sent, but no gateway confirmed it within {CONFIRM_S:g} s")
-    if count := _stops_refused(control):  # of this stop, or of one long ago: the next one tells
+    if count := _stops_refused(control):  # of this stop, or of an earlier one: the next report shows which
         await asyncio.sleep(_APART_S)
         control = await _shown(bus, keys, stop, lambda control: _stops_refused(control) > count, REPEAT_S)
     if control is not None and count:
@@ -82,23 +82,23 @@ async def stop_robot(bus: Bus, keys: KeySpace, stop: Stop) -> None:
     try:
         status = await _last(bus, keys, topics.STATUS, Status, broken=True)
     except PayloadError as error:
-        raise NotReady(f"{keys.robot}: stop taken, but the robot's status cannot be read: {error}") from error
+        raise NotReady(f"{keys.robot}: stop accepted, but the robot's status cannot be read: {error}") from error
     if isinstance(status, Status) and status.state != "established":
         why = status.reason or "no reason known"
-        raise NotReady(f"{keys.robot}: stop taken, but the robot is {status.state}: {why}")
+        raise NotReady(f"{keys.robot}: stop accepted, but the robot is {status.state}: {why}")
     if isinstance(status, Status) and LINK_BLOCKED in (status.reason or ""):
-        raise NotReady(f"{keys.robot}: stop taken, but it waits: {LINK_BLOCKED}")
+        raise NotReady(f"{keys.robot}: stop accepted, but it waits: {LINK_BLOCKED}")
 
 
 async def stop_robots(bus: Bus, realm: str, robots: Iterable[str], stop: Stop) -> dict[str, Outcome]:
-    """Stop robots, so many at a time; return for each what came of it."""
+    """Stop robots, a limited number at a time; return the outcome for each."""
     return await _each(robots, lambda robot: stop_robot(bus, KeySpace(realm, robot), stop))
 
 
 async def unlatch_robot(bus: Bus, keys: KeySpace, name: str) -> tuple[Latch, ...]:
     """Release the latched stops of one robot alone, as ``name``; return those that were released.
 
-    Raises BusError if no gateway answers, Refused as the gateway did; where only stops of the whole fleet are in force,
+    Raises BusError if no gateway answers, Refused as the gateway did; if only stops of the whole fleet are in force,
     its refusal says so.
     """
     latches = await _latches(bus, keys)
@@ -109,10 +109,10 @@ async def unlatch_robot(bus: Bus, keys: KeySpace, name: str) -> tuple[Latch, ...
 
 
 async def unlatch_fleet(bus: Bus, realm: str, robots: Iterable[str], who: str) -> dict[str, Outcome]:
-    """Release the latched stops of the whole fleet at these robots, as ``who``; return for each what came of it.
+    """Release the latched stops of the whole fleet at these robots, as ``who``; return the outcome for each.
 
-    Where ``stop --all`` reached a robot only by its own key, the robot holds the id as its own latch: that is released,
-    too. Robots that do not know a released id are sent it, for they may learn of the stop later.
+    If ``stop --all`` reached a robot only by its own key, the robot holds the id as its own latch: that is released
+    too. Robots that do not know a released id are sent it, because they may learn of the stop later.
     """
     latches = await _each(robots, lambda robot: _latches(bus, KeySpace(realm, robot)))
     known = {robot: answer for robot, answer in latches.items() if isinstance(answer, tuple)}
@@ -128,7 +128,7 @@ async def unlatch_fleet(bus: Bus, realm: str, robots: Iterable[str], who: str) -
 
 
 async def _each(robots: Iterable[str], ask: Callable[[str], Awaitable[T]]) -> dict[str, T | Refused | BusError]:
-    """Do it for each robot, so many at a time; return for each the result, or the error."""
+    """Do it for each robot, a limited number at a time; return the result or the error for each."""
     room = asyncio.Semaphore(AT_ONCE)
 
     async def one(robot: str) -> T | Refused | BusError:
@@ -197,7 +197,7 @@ async def _last(
     timeout_s: float = _ASK_S,
     broken: bool = False,
 ) -> Control | Status | None:
-    """Return the last value of a state; None if there is none. broken: raise PayloadError for one that is none."""
+    """Return the last value of a state; None if there is none. broken: raise PayloadError if it cannot be decoded."""
     with contextlib.suppress(BusError):
         for answer in await bus.ask(keys.key(topic.path), timeout_s=timeout_s):
             try:
@@ -219,5 +219,5 @@ def _stops_refused(control: Control) -> int:
 
 
 def _cut(text: str, most: int) -> str:
-    """Cut a text to so many bytes of UTF-8."""
+    """Truncate a text to a number of bytes of UTF-8."""
     return text.encode("utf-8", "replace")[:most].decode("utf-8", "ignore")

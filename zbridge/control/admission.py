@@ -49,7 +49,7 @@ _STOP_PATH = f"/{topics.CMD_STOP.path}"
 
 
 def is_stop(key: str) -> bool:
-    """Tell whether a command's key is a stop's. Only a stop may have wildcards before its last chunk."""
+    """Return whether a command's key is a stop's. Only a stop may have wildcards before its last chunk."""
     return key.endswith(_STOP_PATH)
 
 
@@ -69,7 +69,7 @@ class RefusalLimit:
         return f"<RefusalLimit {sum(self._counted.values())} dropped>"
 
     def priority(self, code: Code) -> PriorityClass | None:
-        """Return the priority of a refused sample or query; None where it is only counted."""
+        """Return the priority of a refused sample or query; None if it is only counted."""
         if self._allowance.take(self._clock()):
             return PriorityClass.OTHER
         self._counted[code] += 1
@@ -228,6 +228,6 @@ _REFUSALS: dict[Code, Refused] = {
     Code.NO_LEASE: LeaseLost("no lease: acquire first", Code.NO_LEASE),
     Code.MALFORMED: Malformed("wrong proof, or too large"),
     Code.OUT_OF_ORDER: Malformed("repeated or out of order", Code.OUT_OF_ORDER),
-    Code.RATE: RateLimited("too many a second"),
+    Code.RATE: RateLimited("too many per second"),
 }
 """The refusals that ``control`` shows for what was only counted."""

@@ -11,7 +11,7 @@ has the lease, and nobody gets it.
 
 Who calls what. The lease server calls :meth:`acquire`, :meth:`takeover`, :meth:`renew` and :meth:`release` for queries,
 and :meth:`vanished` for lost liveliness tokens. The enforcer calls :meth:`admit` for each command that needs the lease,
-:meth:`require_motion` if the command is motion, :meth:`applied` after the robot was sent it, :meth:`stop`,
+:meth:`check_motion` if the command is motion, :meth:`applied` after the robot was sent it, :meth:`stop`,
 :meth:`require_neutral`, and :meth:`expire` at :meth:`deadline`. After each call it takes :meth:`events`, writes each
 down, and sends the robot its stop at once for one that ``stops``. The admission filters read :attr:`verifier` and
 :attr:`moving` from the bus's threads; all else is for the event loop's thread.
@@ -155,7 +155,7 @@ class Authority:
             holder.expires_at = now + holder.lease_s
         return Sender(holder.who, now - late_s, late_s, stale)
 
-    def require_motion(self) -> None:
+    def check_motion(self) -> None:
         """Raise Refused if the holder must send neutral before the robot moves."""
         if self._needs_neutral is not None:
             raise NeutralFirst(f"{self._needs_neutral}: send a neutral drive first")
@@ -164,8 +164,8 @@ class Authority:
         """Record that the holder's command for one part of the robot was carried out.
 
         given_at: when it was given, on the time line of ``now``; the deadman counts from then. A stale neutral ends
-        motion and does not allow it again. whole: a neutral counts for all parts; else a required
-        neutral must come for each part that moved.
+        motion and does not allow it again. whole: a neutral counts for all parts; otherwise each part that moved needs
+        a neutral.
         """
         parts = self._moving
         if moving and part in parts:  # repeated motion is no input: it only postpones the deadman
@@ -340,7 +340,7 @@ class Authority:
         if self._holders.current is not None:
             self._end(Cause(reason=f"taken over by {who}"))
         elif self.moving:
-            self._require_neutral(Cause(reason=f"moving for nobody when {who} acquired"))
+            self._require_neutral(Cause(reason=f"moving without a driver when {who} acquired"))
         lease, token = self._holders.new_lease()
         self.verifier, self._deadman_s = Verifier(lease, token), deadman_s
         age = CommandAge(min(self._max_age_s, deadman_s) if self._max_age_s < math.inf else math.inf)

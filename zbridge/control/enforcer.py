@@ -43,7 +43,7 @@ class Enforcer:
     """Carries out the decisions of one robot's authority.
 
     limits: None where drives are not limited. save: writes the latched stops down, so that they survive this process;
-    returns what ends when that is done, None where it is.
+    returns what ends when that is done, None if it is.
     """
 
     def __init__(
@@ -100,15 +100,15 @@ class Enforcer:
         """Raise Refused for a command that is too old to set the robot in motion."""
         if sender.stale:
             self._stale.value += 1
-            raise Stale("given too long ago: the network held it up")
+            raise Stale("the command is too old: the network delayed it")
 
-    def require_motion(self) -> None:
-        """Raise Refused where the holder must send neutral before the robot moves."""
-        self.authority.require_motion()
+    def check_motion(self) -> None:
+        """Raise Refused if the holder must send neutral before the robot moves."""
+        self.authority.check_motion()
 
     def permit(self, command: Drive | Motor, now: float) -> Drive | Motor:
-        """Return the motion that the robot may be sent, within the limits; raise Refused where it may not move."""
-        self.authority.require_motion()
+        """Return the motion that the robot may be sent, within the limits; raise Refused if it may not move."""
+        self.authority.check_motion()
         if self._limits is None or not isinstance(command, Drive):
             return command
         limited = self._limits.limit(command, now)
@@ -118,11 +118,11 @@ class Enforcer:
     def moved(self, path: str, command: Drive | Motor, now: float, sender: CommandSender, *, moving: bool) -> None:
         """Record that the robot was sent motion, or neutral.
 
-        Raises Refused where the link has just recovered from a stall: then a stop went instead of the motion.
+        Raises Refused if the link has just recovered from a stall: then a stop went instead of the motion.
         """
         authority = self.authority
         if moving:
-            authority.require_motion()
+            authority.check_motion()
         whole = isinstance(command, Drive)
         authority.applied(path, sender.given_at, moving=moving, stale=sender.stale, whole=whole)
         if isinstance(command, Drive):
@@ -178,7 +178,7 @@ class Enforcer:
         self._remind()
 
     def write_autonomous(self) -> asyncio.Future[None] | None:
-        """Store that the robot was ordered to move by itself; return what ends when that is done, None where it is."""
+        """Store that the robot was ordered to move by itself; return what ends when that is done, None if it is."""
         self.authority.latches.autonomous = True
         return self._save(self.authority.latches)
 

@@ -68,7 +68,7 @@ class CommandAge:
         return (apart_ms - self._baseline_ms) / 1000
 
     def is_stale(self, late_s: float) -> bool:
-        """Tell whether something that is late by so much must not be obeyed."""
+        """Return whether something that is late by so much must not be obeyed."""
         return late_s > self.limit_s
 
 
@@ -88,7 +88,7 @@ class Holder(msgspec.Struct):
     ended: str | None = None
 
     def late_s(self, shown: Authorization, received_ms: float) -> float:
-        """Return by how many seconds a command or question is late; raise Malformed where it should be dated."""
+        """Return by how many seconds a command or question is late; raise Malformed if it should be dated."""
         try:
             return self.age.late_s(shown.t, received_ms)
         except Malformed as error:

@@ -76,7 +76,7 @@ class LatchStore:
     def save(self, latches: Latches) -> asyncio.Future[None] | None:
         """Write what is in force, on a thread; the newest counts. Call it again to try again.
 
-        Returns what ends when everything is written, or could not be; None where nothing is to be written.
+        Returns what ends when everything is written, or could not be; None if nothing is to be written.
         """
         self._put(self._own, latches.record)
         if self._standby in self._written:  # it is in the own file now
@@ -101,7 +101,7 @@ class LatchStore:
     # Reading
 
     def _read(self, path: Path) -> LatchRecord | None:
-        """Read one file; None where there is none."""
+        """Read one file; None if there is none."""
         try:
             with path.open("rb") as file:
                 data = file.read(MOST_BYTES + 1)

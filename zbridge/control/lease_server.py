@@ -155,7 +155,7 @@ class LeaseServer:
         for each in reported:
             _require_own_name(query, each.who or "")
         if not self._reports.take(self._clock()):
-            raise RateLimited(f"more than {REPORTS_HZ:g} tellings a second")
+            raise RateLimited(f"more than {REPORTS_HZ:g} reports a second")
         for each in reported:
             count = min(max(each.count, 1), _COUNTED)
             self._authority.refuse(each.command, refused(each.code, each.reason), each.who, by=name, count=count)
@@ -163,14 +163,14 @@ class LeaseServer:
 
 
 def _bound_name(query: IncomingQuery, command: str) -> str | None:
-    """Return the name in the key of a query, which its payload cannot change; None where the key has none."""
+    """Return the name in the key of a query, which its payload cannot change; None if the key has none."""
     if command not in _BY_NAME or not topics.is_concrete(query.asked):
         return None
     return topics.unescape(query.asked.rpartition("/")[2])
 
 
 def _request(query: IncomingQuery) -> Acquire:
-    """Read who asks for the lease; raise Malformed where it asks, or is to live, in another name than its key's."""
+    """Read who asks for the lease; raise Malformed if it asks, or is to live, in another name than its key's."""
     request = payloads.decode(Acquire, query.payload)
     _require_own_name(query, request.who)
     name = query.asked.rpartition("/")[2]
@@ -181,7 +181,7 @@ def _request(query: IncomingQuery) -> Acquire:
 
 
 def _require_own_name(query: IncomingQuery, who: str) -> None:
-    """Raise Malformed where somebody asks in another name than its key's."""
+    """Raise Malformed if somebody asks in another name than its key's."""
     name = query.asked.rpartition("/")[2]
     if not topics.speaks_for(who, name):
         raise Malformed(f"who = {who[:NAMED]!r}: expected {topics.unescape(name)[:NAMED]!r}, or that and '.suffix'")

@@ -63,7 +63,7 @@ class Standstill:
         self._repeated_until = now + STOP_REPEAT_S
 
     def stop(self) -> None:
-        """Send the robot its stop at once and for a second; raise Refused where it cannot be sent."""
+        """Send the robot its stop at once and for a second; raise Refused if it cannot be sent."""
         now = self._clock()
         self._send(now, now + STOP_REPEAT_S)
         self._repeated_until = now + STOP_REPEAT_S

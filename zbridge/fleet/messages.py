@@ -175,7 +175,7 @@ class LinkStatus(msgspec.Struct, frozen=True):
 RobotState = Literal["offline", "connecting", "handshaking", "established", "closing"]
 
 
-LINK_BLOCKED = "the robot's link takes nothing"
+LINK_BLOCKED = "the robot's link is stalled"
 """Stands in the reason of a :class:`Status` while nothing that is written reaches the robot."""
 
 
@@ -195,7 +195,7 @@ class Status(FleetMessage, frozen=True):
 class Refusal(msgspec.Struct, frozen=True, kw_only=True):
     """A command that was not carried out, and how often. code: a :class:`zbridge.errors.Code`, for programs.
 
-    by: the listener that refused it, ``hq.<listener>``; None where the robot's gateway did.
+    by: the listener that refused it, ``hq.<listener>``; None if the robot's gateway did.
     """
 
     who: str | None
@@ -253,7 +253,7 @@ class Drive(FleetMessage, frozen=True):
 
     @property
     def moving(self) -> bool:
-        """Tell motion from neutral."""
+        """Return whether this is motion, not neutral."""
         return bool(self.forward or self.left or self.turn)
 
 
@@ -264,7 +264,7 @@ class Motor(FleetMessage, frozen=True):
 
     @property
     def moving(self) -> bool:
-        """Tell motion from neutral. A linear motor's position is unknown here, so any value but 0 is motion."""
+        """Return whether this is motion, not neutral. For a linear motor any value but 0 is."""
         return bool(self.value)
 
 

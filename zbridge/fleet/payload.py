@@ -115,7 +115,7 @@ def _decoder(message: type[FleetMessage]) -> msgspec.msgpack.Decoder[Any]:
 
 
 def _with_ranges(scan: Scan) -> Any:
-    """Read the bytes of the ranges as an array; raise ValueError where the last one is incomplete."""
+    """Read the bytes of the ranges as an array; raise ValueError if the last one is incomplete."""
     import numpy as np
 
     if len(scan.ranges) % 4:

@@ -129,7 +129,7 @@ _ESCAPED = re.compile(rb"[^A-Za-z0-9_.-]")
 
 
 def is_name(name: str) -> bool:
-    """Tell whether ``name`` is a key chunk without escapes."""
+    """Return whether ``name`` is a key chunk without escapes."""
     return _NAME.fullmatch(name) is not None
 
 
@@ -146,7 +146,7 @@ def unescape(chunk: str) -> str:
 
 
 def speaks_for(who: str, chunk: str) -> bool:
-    """Tell whether a program that queries this key chunk may call itself ``who``: the chunk's name, or name.suffix.
+    """Return whether a program that queries this key chunk may call itself ``who``: the chunk's name, or name.suffix.
 
     Access rules on keys can so restrict each program to its own name.
     """
@@ -155,7 +155,7 @@ def speaks_for(who: str, chunk: str) -> bool:
 
 
 def may_name_token(alive: str, chunk: str) -> bool:
-    """Tell whether a program that queries this key chunk may name the liveliness token ``@alive/<alive>`` as its own.
+    """Return whether a program that queries this key chunk may name the liveliness token ``@alive/<alive>`` as its own.
 
     Access rules let each program declare tokens of its own name only: ``operator.<name>.<id>``, ``hq.<name>.<id>``.
     """
@@ -293,7 +293,7 @@ def whoami(realm: str, name: str) -> str:
 
 
 def split_key(key: str) -> tuple[str, str, str] | None:
-    """Split a full key into realm, robot and path; None where it has fewer chunks."""
+    """Split a full key into realm, robot and path; None if it has fewer chunks."""
     realm, _, rest = key.partition("/")
     robot, _, path = rest.partition("/")
     return (realm, robot, path) if path else None
@@ -301,7 +301,7 @@ def split_key(key: str) -> tuple[str, str, str] | None:
 
 @lru_cache(maxsize=65536)
 def matches(key_expr: str, key: str) -> bool:
-    """Tell whether a key expression matches a key, as on the bus: ``@...`` matches only itself."""
+    """Return whether a key expression matches a key, as on the bus: ``@...`` matches only itself."""
     return _follow(tuple(key_expr.split("/")), tuple(key.split("/")))
 
 

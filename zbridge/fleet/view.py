@@ -53,7 +53,7 @@ class RobotView:
 
     @property
     def missing(self) -> str | None:
-        """Why the robot cannot be used now; None where it can."""
+        """Why the robot cannot be used now; None if it can."""
         if not self.alive or self.status is None:
             return "no gateway serves the robot"
         if self.status.state != "established":

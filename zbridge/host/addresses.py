@@ -61,7 +61,7 @@ class AddressHolder(msgspec.Struct, frozen=True):
 
 
 def resolve(addresses: Iterable[DeviceAddress], within_s: float = RESOLVE_S) -> dict[DeviceAddress, frozenset[str]]:
-    """Give what each address is on this machine, in all its forms; nothing for what is not locked. May take a while."""
+    """Resolve each address to all its forms on this machine; to none if it is not locked. May block."""
     addresses = list(addresses)
     hosts = {address.host for address in addresses if isinstance(address, Address) and address.port}
     ips = _resolved(hosts, within_s)
@@ -125,7 +125,7 @@ class Addresses:
         self._taken: dict[str, tuple[Path, bool]] = {}
 
     def add(self, path: Path, forms: Iterable[str], shares: bool) -> None:
-        """Enter the addresses of a file; raise ConfigError where another file has one of them."""
+        """Enter the addresses of a file; raise ConfigError if another file has one of them."""
         forms = list(forms)
         for form in forms:
             other, both = self._taken.get(form, (path, True))

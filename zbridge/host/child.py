@@ -63,7 +63,7 @@ _NUMBERS = 16 * SLOTS
 """Links are numbered up to here, then again from the lowest free number."""
 _encode = msgspec.msgpack.Encoder().encode
 Describe = Callable[[Parcel, Budget], HandoverState | None]
-"""``describe(parcel, budget)``: describe what a successor needs; None where none could resume."""
+"""``describe(parcel, budget)``: describe what a successor needs; None if none could resume."""
 
 
 class _Listed(Parcel):

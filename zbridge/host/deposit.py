@@ -64,7 +64,7 @@ class Deposit:
             self.predecessor.close_named(name)
 
     async def stop(self, times: int) -> bool | None:
-        """Write the robot's stop so often; whether its link accepted it, None where there is no link or no stop."""
+        """Write the robot's stop so often; whether its link accepted it, None if there is no link or no stop."""
         last = self.last_stop
         at = self
         while not len(at.duplicates) and at.predecessor is not None:
@@ -84,9 +84,9 @@ class Deposit:
         return bool(len(self.duplicates)) or (self.predecessor is not None and self.predecessor.has_links)
 
     def inheritance(self) -> tuple[HandoverState, Parcel]:
-        """Give what a successor of the dead process can take over; raise HandoverError with the reason for nothing.
+        """Return what a successor of the dead process can take over; raise HandoverError with the reason for nothing.
 
-        Raises OSError where there is no free descriptor.
+        Raises OSError if there is no free descriptor.
         """
         state, sockets = self._state()
         partials = [self._partial(name) for name, at in sockets if at == 0]
@@ -132,7 +132,7 @@ class Deposit:
     # Link by link
 
     def _state(self) -> tuple[bytes, tuple[tuple[str, int], ...]]:
-        """Give the newest state, and its sockets by the names of their links."""
+        """Return the newest state, and its sockets by the names of their links."""
         if self.deposited is None:
             return self.predecessor._state() if self.predecessor is not None else (b"", ())
         names = [(self.duplicates.name_of(link), at) for link, at in self.deposited.sockets]
@@ -142,7 +142,7 @@ class Deposit:
         return data, tuple((name, at) for name, at in names if name is not None)
 
     def _partial(self, name: str) -> Partial | None:
-        """Give where the stream of a link was cut; None where nobody can resume it."""
+        """Return where the stream of a link was cut; None if nobody can resume it."""
         link = self.duplicates.link_of(name)
         if link is not None:
             if self.memory is None:
@@ -152,7 +152,7 @@ class Deposit:
         return self.predecessor._partial(name) if self.predecessor is not None else None
 
     def _descriptor(self, name: str, at: int) -> int | None:
-        """Give a descriptor of a link; None where there is none, or half a frame was written."""
+        """Return a descriptor of a link; None if there is none, or half a frame was written."""
         link = self.duplicates.link_of(name)
         if link is not None:
             return self.duplicates.descriptor(link, at)

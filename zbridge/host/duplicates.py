@@ -49,7 +49,7 @@ class Duplicate(msgspec.Struct):
         close_all(descriptors[2:])
 
     def descriptor(self, at: int) -> int | None:
-        """Give the stream's descriptor (0), or that of datagrams (1)."""
+        """Return the stream's descriptor (0), or that of datagrams (1)."""
         return (self.stream, self.datagrams)[at] if at in (0, 1) else None
 
     def close(self) -> None:
@@ -65,7 +65,7 @@ class Duplicate(msgspec.Struct):
                     stream.recv(_READ_BYTES, socket.MSG_DONTWAIT)
 
     async def stop(self, last: LastStop, times: int) -> bool:
-        """Write the stop so often; False where the link is stalled.
+        """Write the stop so often; False if the link is stalled.
 
         The first frame waits for one gap: the dead process may have written a moment ago.
         """
@@ -137,17 +137,17 @@ class Duplicates:
         self._links.setdefault(link, Duplicate(link, name, drives)).set_descriptors(descriptors)
 
     def name_of(self, link: int) -> str | None:
-        """Give the name of a link; None where there is none of this number."""
+        """Return the name of a link; None if there is none of this number."""
         return self._links[link].name if link in self._links else None
 
     def link_of(self, name: str) -> int | None:
-        """Give the number of the newest link of this name."""
+        """Return the number of the newest link of this name."""
         return next((link for link, each in reversed(self._links.items()) if each.name == name), None)
 
     def descriptor(self, link: int, at: int) -> int | None:
-        """Give a descriptor of a link: 0 its stream's, 1 that of datagrams.
+        """Return a descriptor of a link: 0 its stream's, 1 that of datagrams.
 
-        None where there is none, or half a frame was written.
+        None if there is none, or half a frame was written.
         """
         duplicate = self._links.get(link)
         return duplicate.descriptor(at) if duplicate is not None and duplicate.boundary.outgoing else None
@@ -182,7 +182,7 @@ class Duplicates:
         self.close()
 
     async def stop(self, last: LastStop, times: int = TIMES) -> bool | None:
-        """Write the robot's stop so often; whether its link accepted it, None where there is no link or no stop."""
+        """Write the robot's stop so often; whether its link accepted it, None if there is no link or no stop."""
         driving = [link for link in self._links.values() if link.drives]
         if not driving or not last.frames:
             return None

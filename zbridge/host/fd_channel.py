@@ -140,7 +140,7 @@ class FdChannel:
         return cls(socket.socket(fileno=descriptor))
 
     def fileno(self) -> int:
-        """Give the descriptor; -1 once it is closed."""
+        """Return the descriptor; -1 once it is closed."""
         return self._socket.fileno()
 
     def send(self, message: Message, descriptors: Sequence[int] = ()) -> bool:

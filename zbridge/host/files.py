@@ -145,7 +145,7 @@ def compare(running: Mapping[Path, RobotFile], seen: Iterable[RobotFile]) -> Cha
 
 
 def read_all(sources: tuple[Path, ...], most_bytes: int = FILE_BYTES) -> list[RobotFile]:
-    """Read all robot files; raise ConfigError where two name one robot or one address, or no file is sound."""
+    """Read all robot files; raise ConfigError if two name one robot or one address, or no file is sound."""
     files = located(read(path, most_bytes) for path in paths_of(sources))
     if not files:
         raise ConfigError(f"{', '.join(map(str, sources))}: no robot file (*.toml)")

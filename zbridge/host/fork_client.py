@@ -287,7 +287,7 @@ class ForkClient:
             self.unsettled = stamp != old.stamp and not stamp.settled
             if stamp in (old.stamp, self._refused) or not stamp.settled:
                 return
-            log.info("the installation has changed: its code is loaded")
+            log.info("the installed code has changed: loading it")
         try:
             server = await _Server.start(self._command, stamp)
         except NotReady as error:
@@ -309,7 +309,7 @@ class ForkClient:
 
 @contextlib.contextmanager
 def _in_memory(content: bytes) -> Iterator[int]:
-    """Write the content of a file to memory; give its descriptor. Raise NotReady where that is not possible."""
+    """Write the content of a file to memory; give its descriptor. Raise NotReady if that is not possible."""
     try:
         descriptor = os.memfd_create("zbridge file")
         try:
@@ -343,11 +343,11 @@ def _spawned(command: Sequence[str]) -> tuple[subprocess.Popen[bytes], FdChannel
 
 
 def fork_server_command() -> list[str]:
-    """Give the command that starts a fork server of the installed code; its last argument is still missing."""
+    """Return the command that starts a fork server of the installed code; its last argument is still missing."""
     return module_command("zbridge.cli.fork_server")
 
 
 def module_command(module: str) -> list[str]:
-    """Give the command that runs a module of the installed code."""
+    """Return the command that runs a module of the installed code."""
     here = Path.cwd() == HOME.parent  # the folder is searched for modules then
     return [sys.executable, *([] if here else ["-P"]), "-m", module]

@@ -35,7 +35,7 @@ _UNTOUCHED, _READING, _CUT = range(3)
 
 
 def slot_of(link: int) -> int:
-    """Give the slot of a link by its number."""
+    """Return the slot of a link by its number."""
     return link % SLOTS
 
 
@@ -98,7 +98,7 @@ class MemoryReader:
         return self._map[slot_of(link) * _SLOT_BYTES] != _UNTOUCHED
 
     def partial(self, link: int) -> Partial | None:
-        """Give the incomplete frame of a link; None where nobody can resume its stream."""
+        """Return the incomplete frame of a link; None if nobody can resume its stream."""
         at = slot_of(link) * _SLOT_BYTES
         state, size, skip = _HEAD.unpack_from(self._map, at)
         if state == _UNTOUCHED:

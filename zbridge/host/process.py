@@ -217,7 +217,7 @@ class GatewayProcess:
             deposit.share(state.memory)
 
     def hand_deposit_to(self, successor: GatewayProcess) -> None:
-        """Give a successor what this process deposited: it counts until the successor has made its own deposit."""
+        """Return a successor what this process deposited: it counts until the successor has made its own deposit."""
         deposit, self.deposit = self.deposit, Deposit()
         if successor.deposit.deposited is None:
             successor.deposit.predecessor = deposit

@@ -140,11 +140,11 @@ def store(state: SupervisorState) -> int:
 
 
 def restore(descriptor: int) -> SupervisorState:
-    """Read a state, and leave the descriptor open; raise HandoverError where it cannot be understood."""
+    """Read a state, and leave the descriptor open; raise HandoverError if it cannot be understood."""
     try:
         data = os.pread(descriptor, STATE_BYTES, 0)
         if (version := _head(data).version) != VERSION:
-            raise HandoverError(f"the supervisor left a state of version {version}, this code takes version {VERSION}")
+            raise HandoverError(f"the supervisor left state version {version}, this code accepts version {VERSION}")
         return _decode(data)
     except (OSError, msgspec.MsgspecError, UnicodeError, RecursionError) as error:
         raise HandoverError(f"no state of a supervisor: {error}") from error

@@ -206,7 +206,7 @@ class Runner:
             if process.succeeded:
                 if self._promote_successor(process):
                     continue
-                how = "handed over to nobody"
+                how = "it was not handed over"
             self.process = None
             self._former.add(process)  # it may still have to be waited for
             if not (how is None or (process.asked_to_end and not process.deposit.has_links)):
@@ -218,7 +218,7 @@ class Runner:
             self._settled.set()
 
     async def _crashed(self, process: GatewayProcess, how: str) -> GatewayProcess | None:
-        """Stop the robot of a process that died; give the process that has its connections, None where none has."""
+        """Stop the robot of a process that died; give the process that has its connections, None if none has."""
         self._attended.clear()
         log.error("%s: process %d %s", self.file.robot, process.pid, how)
         await process.deposit.stop(1)  # before anything that may take time
@@ -236,10 +236,10 @@ class Runner:
         return successor
 
     async def _inherited(self, process: GatewayProcess, stopped: asyncio.Future[None]) -> GatewayProcess | None:
-        """Start a successor of a dead process that keeps its connections; None where that is not possible."""
+        """Start a successor of a dead process that keeps its connections; None if that is not possible."""
         reason = ""
         if not await process.gone(GONE_S):
-            reason = "it may still be within a read"
+            reason = "it may still be reading"
         elif self._restart_delay.failures >= RESUMED_CRASHES and process.lived_s < HEALTHY_S:
             reason = f"{RESUMED_CRASHES} processes that took it over have crashed"
         for _ in range(0 if reason else OFFERS):
@@ -257,7 +257,7 @@ class Runner:
         return None
 
     def _promote_successor(self, process: GatewayProcess) -> bool:
-        """Let the successor be the robot's process; False where there is none."""
+        """Let the successor be the robot's process; False if there is none."""
         successor = self._succession.take()
         self._settled.set()
         if successor is None:

@@ -89,11 +89,11 @@ class Runners:
             self.by_path[file.path] = runner = self.by_path.pop(path)
             runner.file = file
         for file in changes.faulty:
-            runs = "its robot continues as before" if file.path in self.by_path else "no robot runs by it"
+            runs = "its robot continues as before" if file.path in self.by_path else "no gateway uses it"
             log.error("%s: %s", file.fault, runs)
             self.faults[file.path] = str(file.fault)
         for path in changes.gone:
-            log.info("%s: is gone: its robot's gateway ends", path)
+            log.info("%s: was removed: its robot's gateway ends", path)
             self._running.start(self._leave(self.by_path.pop(path)))
         for file in changes.changed:
             log.info("%s: has changed", file.path)
@@ -131,7 +131,7 @@ class Runners:
             if late_s > LATE_S:
                 process.watchdog.extend()
             if not process.over.done() and now >= process.watchdog.deadline:
-                process.kill(f"gave no sign of life for {process.watchdog.silent_s(now):.1f} s")
+                process.kill(f"sent no heartbeat for {process.watchdog.silent_s(now):.1f} s")
             elif not process.over.done():
                 deadlines.append(process.watchdog.deadline)
         self.check_at = max(now + 0.01, min(deadlines))

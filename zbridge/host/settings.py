@@ -45,7 +45,7 @@ def load_host(directory: Path) -> HostSettings:
 
 
 def robot_files(directory: Path) -> list[Path]:
-    """Return the robot files of a directory in the order of their names; raise ConfigError where it is none."""
+    """Return the robot files of a directory in the order of their names; raise ConfigError if it is none."""
     try:
         return sorted(path for path in directory.iterdir() if path.suffix == ".toml" and path.name != HOST_FILE)
     except OSError as error:
@@ -53,7 +53,7 @@ def robot_files(directory: Path) -> list[Path]:
 
 
 def require_different_robots(plans: Iterable[tuple[Path, GatewayPlan]]) -> None:
-    """Raise ConfigError where two files name the same robot of one realm, or of one address, or listen at one address.
+    """Raise ConfigError if two files name the same robot of one realm, or of one address, or listen at one address.
 
     Resolves host names, which may take RESOLVE_S.
     """

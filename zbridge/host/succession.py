@@ -151,7 +151,7 @@ class Succession:
         if self.successor is successor and not process.succeeded:
             self.successor = None
             self._settled.set()
-            log.error("%s: process %d has not taken over: %s", self._robot, successor.pid, successor.how)
+            log.error("%s: process %d did not take over: %s", self._robot, successor.pid, successor.how)
             successor.close()
 
     def take(self) -> GatewayProcess | None:
@@ -200,9 +200,9 @@ class Succession:
 
 
 async def _give(channel: HandoverChannel, given: HandoverState, parcel: Parcel) -> None:
-    """Give a successor what a dead process left, until it waits for the word to go; raise HandoverError."""
+    """Return a successor what a dead process left, until it waits for the word to go; raise HandoverError."""
     hello = await channel.receive(Hello, START_S)
     if hello.version != given.version:
-        raise HandoverError(f"it takes states of version {hello.version}, the dead process left {given.version}")
+        raise HandoverError(f"it accepts states of version {hello.version}, the dead process left {given.version}")
     await channel.send(given, parcel)
     await channel.receive(Up, TAKE_OVER_S)

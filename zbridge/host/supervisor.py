@@ -82,7 +82,7 @@ class Supervisor:
     async def run(self) -> None:
         """Keep the gateways running until cancelled; then end all of them, each with its robot's stop.
 
-        Raise ConfigError where two files name one robot, or no file is sound.
+        Raise ConfigError if two files name one robot, or no file is sound.
         """
         loop = asyncio.get_running_loop()
         loop.set_default_executor(quiet_threads())
@@ -177,7 +177,7 @@ class Supervisor:
             log.error("the supervisor continues with the old code: %s", error)
 
     def snapshot(self) -> SupervisorState | None:
-        """Give all that the code in place of this one needs; None while something is under way."""
+        """Return all that the code in place of this one needs; None while something is under way."""
         if not self.runners.is_idle:
             return None
         server, leaving = self._forks.state

@@ -97,9 +97,9 @@ class Together:
             await asyncio.Event().wait()
 
     def start(self, name: str, plan: GatewayPlan, after_s: float = 0.0) -> None:
-        """Start a gateway in ``after_s`` seconds; raise ValueError where the name is taken."""
+        """Start a gateway in ``after_s`` seconds; raise ValueError if the name is taken."""
         if name in self._tasks:
-            raise ValueError(f"{name!r}: runs already")
+            raise ValueError(f"{name!r}: is already running")
         self._tasks[name] = asyncio.create_task(self._keep_running(name, plan, after_s), name=f"gateway {name}")
 
     async def stop(self, name: str) -> None:

@@ -9,7 +9,7 @@ from zbridge.protocol.networks import is_among
 
 ADDRESSES = 1024
 """Addresses whose connections are counted separately; beyond that the address seen longest ago is forgotten."""
-FULL = "as many clients as there can be"
+FULL = "the maximum number of clients is connected"
 
 
 class Admission:

@@ -33,7 +33,7 @@ SWEEP_S = 0.5
 """Seconds between two calls of :meth:`Client.sweep`."""
 TELL_S = 5.0
 """Seconds within which a client is not told the same text again."""
-_NOT_TAKEN = "a message of a client not understood"
+_NOT_TAKEN = "cannot decode a client's message"
 
 
 class Client:
@@ -88,7 +88,7 @@ class Client:
             self.session.traffic.dropped += 1
             self._context.counts.dropped.value += 1
         except Exception as error:
-            self._context.failures.note("a client not sent", error)
+            self._context.failures.note("cannot send to a client", error)
         self.conversation.pump()
 
     def tell(self, text: str, *, again: bool = False) -> None:
@@ -123,7 +123,7 @@ class Client:
 
     @property
     def blocker(self) -> str | None:
-        """Why the program's connection cannot be handed to another process now; None where it can."""
+        """Why the program's connection cannot be handed to another process now; None if it can."""
         return self.conversation.blocker
 
     def export(self, parcel: Parcel) -> Exported:
@@ -153,7 +153,7 @@ class Client:
         self.close()
 
     def sweep(self) -> None:
-        """End a client that takes nothing, is silent for too long, or sends nothing but malformed messages."""
+        """End a client that takes nothing, is silent for too long, or sends only malformed messages."""
         traffic, idle_s = self.session.traffic, self._context.settings.idle_s
         self._stalled_s = max(0.0, self._stalled_s + (SWEEP_S if self.conversation.stalled else -SWEEP_S))
         self._silent_s = self._silent_s + SWEEP_S if traffic.bytes_in == self._bytes_in else 0.0
@@ -161,9 +161,9 @@ class Client:
         before, self._frames = self._frames, (traffic.malformed, traffic.frames_in)
         malformed, frames = (now - then for now, then in zip(self._frames, before, strict=True))
         if malformed >= MALFORMED and malformed >= frames:
-            self.conversation.close("nothing but malformed messages")
+            self.conversation.close("only malformed messages")
         elif self._stalled_s >= STALL_S:
-            self.conversation.cut(f"took nothing for {STALL_S:g} s")
+            self.conversation.cut(f"read nothing for {STALL_S:g} s")
         elif idle_s is not None and self._silent_s >= idle_s:
             self.conversation.close(f"silent for {idle_s:g} s")
 

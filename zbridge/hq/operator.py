@@ -97,7 +97,7 @@ class Operator:
         elif isinstance(message, Raw):
             self._require_robot()
             if topics.unescape(topic.path.rpartition("/")[2]) != self._bridge.view.protocol:
-                raise Unsupported("the robot has no such packets")
+                raise Unsupported("the robot does not know such packets")
             self._follow(self.intent.motion(now, lasts=False), topic, message)
         else:
             if not self._allowance.take(now):
@@ -196,7 +196,7 @@ class Operator:
             self._require_robot()
             if self._bridge.view.protocol != self._protocol:
                 self._choose(Mode("manual"), now)
-                raise Unsupported("the robot does not move by itself, only by the stick")
+                raise Unsupported("this robot has no autonomous mode; use the joystick")
         do = self.intent.choose(message.mode, now)
         if do is StickAction.RELEASE:
             self._tell_mode(self._queue.put)  # what waits is dropped, so it overtakes nothing

@@ -41,7 +41,7 @@ class RobotQueries:
         Raises Unsupported if robots are not asked for this topic.
         """
         if topic.path not in _ANSWERS:
-            raise Unsupported(f"robots are not asked for {topic.path}")
+            raise Unsupported(f"{topic.path} cannot be queried")
         waiting = self._waiting.get(topic.path)
         if waiting is None:
             self._waiting[topic.path] = {asker: answered}

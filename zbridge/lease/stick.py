@@ -84,7 +84,7 @@ class StickRules(msgspec.Struct, frozen=True):
     neutral_counts: bool = False
     quiet_s: float = math.inf
     lapsed: str = "deadman"
-    advice: str = ": release the stick first"
+    advice: str = ": centre the joystick first"
 
 
 class Stick:

@@ -1,4 +1,4 @@
-"""Bearings: distance sensors that look in known directions make a scan, and a scan makes distance sensors. Sans-IO.
+"""Bearings: converts distance sensors of known directions to a scan, and a scan to distance sensors. Sans-IO.
 
 Bearings are counter-clockwise from ahead (REP 103); ranges are metres.
 """
@@ -14,9 +14,9 @@ from zbridge.fleet.messages import Floats, Scan, Scanner
 from zbridge.protocol.kept import Form, Kept
 
 MOST_POINTS = 100_000
-"""Points that are believed of a scanner that nobody has seen a scan of."""
+"""Most points accepted of a scanner before its first scan."""
 _MOST_RAD = 1e6
-"""A geometry with angles beyond this is absurd, and covers no sector."""
+"""A geometry with angles beyond this is invalid, and covers no sector."""
 
 if TYPE_CHECKING:
     import numpy as np
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 class BearingScan(Kept):
     """Makes one scan of the readings of several distance sensors.
 
-    ``bearings_deg``: where each sensor looks, degrees; at least one. ``range_m``: the least and the greatest range that
-    is believed; a reading outside is NaN. Evenly spread sensors give a point each, others a point a degree.
+    ``bearings_deg``: the direction of each sensor, degrees; at least one. ``range_m``: the least and the greatest valid
+    range; a reading outside is NaN. Evenly spread sensors give a point each, others a point a degree.
     """
 
     kept: ClassVar[dict[str, Any]] = {
@@ -54,7 +54,7 @@ class BearingScan(Kept):
         return f"<BearingScan of {len(self._places)} sensors, {len(self._fresh)} fresh>"
 
     def take(self, name: str, range_m: float, stamp_ns: int) -> Scan | None:
-        """Enter one reading (metres; NaN: none); give the scan when every sensor has a new one.
+        """Add one reading (metres; NaN: none); return the scan when every sensor has a new one.
 
         The reading of a sensor without a bearing is ignored. The stamp of a scan is that of its last reading.
         """
@@ -91,11 +91,11 @@ class Sectors:
         return f"<Sectors {self._count}>"
 
     def covered(self, scan: Scan | Scanner) -> tuple[int, ...]:
-        """List the sectors in which a scan, or a scanner, has points; none where its geometry is absurd."""
+        """List the sectors in which a scan, or a scanner, has points; none if its geometry is invalid."""
         return tuple(self._cut(scan))
 
     def nearest_m(self, scan: Scan) -> dict[int, float]:
-        """Give the nearest range of each covered sector, metres; ``range_max`` where it has no valid one.
+        """Return the nearest range of each covered sector, metres; ``range_max`` where it has no valid one.
 
         The sectors of the last scan are kept: asking again for the same object costs nothing.
         """
@@ -111,7 +111,7 @@ class Sectors:
         return self._nearest_m
 
     def _cut(self, scan: Scan | Scanner) -> dict[int, _Indices]:
-        """Give the indices of the points of each covered sector; kept until the geometry changes."""
+        """Return the indices of the points of each covered sector; kept until the geometry changes."""
         count = len(scan.ranges) if isinstance(scan, Scan) else min(max(scan.points, 0), MOST_POINTS)
         geometry = (scan.angle_min, scan.angle_increment, count)
         if not abs(scan.angle_min) + abs(scan.angle_increment) * count < _MOST_RAD:

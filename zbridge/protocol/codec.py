@@ -13,7 +13,7 @@ from zbridge.wire.frames import FrameEnd
 class Codec(msgspec.Struct, frozen=True):
     """The messages that one side sends in one dialect, and how they are written, read and framed.
 
-    write: gives one frame, raises EncodeError. read: takes one frame, raises ProtocolError and nothing else.
+    write: returns one frame, raises EncodeError. read: decodes one frame, raises ProtocolError and nothing else.
     messages: examples. A class stands for one example whose fields the kit fills in.
     """
 

@@ -117,7 +117,7 @@ class DeviceClock(Kept):
         return self._drift_ppm
 
     def stamp_ns(self, device_ms: int, arrived_ns: int) -> int:
-        """Give the Unix time, ns, at which the counter was ``device_ms``; never after ``arrived_ns``.
+        """Return the Unix time, ns, at which the counter was ``device_ms``; never after ``arrived_ns``.
 
         Stamps do not go back while counter and arrivals do not; equal counters get equal stamps. The stamp is
         ``arrived_ns`` for a value that is no counter, for the first packets after a jump, and for a counter that has
@@ -158,14 +158,14 @@ class DeviceClock(Kept):
         return arrived_ns
 
     def _step_ms(self, since_ms: int, device_ms: int) -> int:
-        """Give the step from one value of the counter to another, the shorter way round."""
+        """Return the step from one value of the counter to another, the shorter way round."""
         if self._wrap_ms is None:
             return device_ms - since_ms
         half_ms = self._wrap_ms // 2
         return (device_ms - since_ms + half_ms) % self._wrap_ms - half_ms
 
     def _far(self, step_ms: int, step_ns: int) -> bool:
-        """Tell whether a step of the counter contradicts the step of the gateway's clock. Integers only."""
+        """Return whether a step of the counter contradicts the step of the gateway's clock. Integers only."""
         return abs(step_ns - step_ms * _NS_PER_MS) > self._jump_ns or abs(step_ms) > _SILENCE_MS
 
     def _astray(self, device_ms: int, arrived_ns: int, step_ms: int) -> int:
@@ -176,7 +176,7 @@ class DeviceClock(Kept):
         return self._begin(device_ms, arrived_ns)
 
     def _jumped(self, late_ns: float, arrived_ns: int) -> bool:
-        """Tell whether a clock has jumped: all packets have been late for ``jump_s``."""
+        """Return whether a clock has jumped: all packets have been late for ``jump_s``."""
         if late_ns <= _LATE_NS:
             self._late_packets = 0
             return False
@@ -186,7 +186,7 @@ class DeviceClock(Kept):
         return self._late_packets >= LATE_PACKETS and arrived_ns - self._late_since_ns > self._jump_ns
 
     def _line_ns(self, now_ms: int) -> int:
-        """Give the gateway's time at ``now_ms`` of the counter, by the line."""
+        """Return the gateway's time at ``now_ms`` of the counter, by the line."""
         return self._origin_ns + now_ms * _NS_PER_MS + int(self._height_ns + self._drift_ppm * now_ms)
 
     def _learn(self, now_ms: int, offset_ns: int) -> None:
@@ -237,7 +237,7 @@ def _trim(hull: list[_Point], drift_ppm: float) -> list[_Point]:
 
 
 def _slope_at_middle(hull: list[_Point], guess_ppm: float) -> float:
-    """Give the slope of the edge over the middle, ns per ms; ``guess_ppm`` for a single point."""
+    """Return the slope of the edge over the middle, ns per ms; ``guess_ppm`` for a single point."""
     middle = (hull[0][0] + hull[-1][0]) / 2
     for (x0, y0), (x1, y1) in pairwise(hull):
         if x1 >= middle:

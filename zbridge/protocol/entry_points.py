@@ -1,4 +1,4 @@
-"""Finds what installed packages contribute, whatever other packages look like. Sans-IO but for reading their files."""
+"""Finds what installed packages contribute, even if other packages are broken. Sans-IO but for reading their files."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def find_entry_point(group: str, name: str) -> str | None:
 
 
 def _text_of(file: Path) -> str:
-    """Read a list of entry points; an unreadable one is empty: other packages must not suffer from it."""
+    """Read a list of entry points; an unreadable one counts as empty, so that it does not affect other packages."""
     try:
         return file.read_text("utf-8")
     except (OSError, ValueError):

@@ -2,27 +2,27 @@
 
 Theory of operation
 -------------------
-An :class:`Exchange` is an outbox that waits. A session writes what ``take`` gives, as with any outbox.
+An :class:`Exchange` is an outbox that waits. A session writes what ``take`` returns, as with any outbox.
 
-    FREE     no answer is awaited. ``take`` gives the next request, in the order below. A request that
+    FREE     no answer is awaited. ``take`` returns the next request, in the order below. A request that
              ``expects`` an answer leads to WAITING, another one stays in FREE.
-    WAITING  a request is on the wire. ``take`` gives None. ``answered`` (the matching answer came) and
+    WAITING  a request is on the wire. ``take`` returns None. ``answered`` (the matching answer came) and
              ``expire`` (its time limit passed) lead to FREE.
-    OPEN     the session is closing. ``take`` gives what is left and awaits nothing.
+    OPEN     the session is closing. ``take`` returns what is left and awaits nothing.
 
-Order of requests: urgent ones (the stop), then slots and the queue in turns. The rules of :class:`Outbox` hold:
+Order of requests: urgent ones (the stop), then slots and queue alternately. The rules of :class:`Outbox` hold:
 ``set`` keeps the newest motion of a slot; an urgent group replaces the motion of its slot and is never
 dropped; ``put`` refuses a request when too many wait. So a stop waits for one answer at most: ``answer_s`` seconds.
 
 A poll is a slot that repeats: ``poll`` sends a request every ``period_s``. A poll that is late is sent once, and the
 next one is due a period after it; missed polls are not made up.
 
-Silence: each request without an answer within ``answer_s`` counts as failed. :class:`ExchangeSession` tells the
-session (``unanswered``). After ``busy_after`` failures in a row the robot takes no commands: the gateway stops it, and
-motion needs a neutral. After ``lost_after`` in a row the session ends. One answer ends the silence.
+Silence: each request without an answer within ``answer_s`` counts as failed. :class:`ExchangeSession` notifies the
+session (``unanswered``). After ``busy_after`` failures in a row the robot accepts no commands: the gateway stops it,
+and neutral is needed. After ``lost_after`` in a row the session ends. One answer ends the silence.
 
-An answer that matches no request on the wire is malformed: it is counted and not handed on. A robot that also speaks
-unasked overrides ``unasked``.
+An answer that matches no request on the wire is malformed: it is counted and dropped. A robot that also sends
+unsolicited messages overrides ``unasked``.
 """
 
 from __future__ import annotations
@@ -89,13 +89,13 @@ class Exchange(Outbox):
         return request
 
     def written(self, now: float) -> None:
-        """Begin the gap and the time limit now: the request taken last was written only now."""
+        """Start the gap and the time limit now: the last request was written only now."""
         super().written(now)
         if self.awaited is not None:
             self._answer_at = now + self.answer_s
 
     def deadline(self) -> float | None:
-        """Tell when ``take`` will have something; None while an answer is awaited, or nothing waits."""
+        """Return when ``take`` will have something; None while an answer is awaited, or nothing waits."""
         return None if self.awaited is not None else super().deadline()
 
     def answered(self) -> None:
@@ -108,7 +108,7 @@ class Exchange(Outbox):
         return self._answer_at
 
     def expire(self, now: float) -> bytes | None:
-        """Let the request on the wire fail if its time is up; give it."""
+        """Fail the request on the wire if its time is up, and return it."""
         if now < self._answer_at:
             return None
         request, self.awaited, self._answer_at = self.awaited, None, math.inf
@@ -122,7 +122,7 @@ class Exchange(Outbox):
 
 
 class ExchangeSession(Session[M]):
-    """A session of a request-and-answer protocol, in the role of the one that asks.
+    """A session of a request-and-answer protocol, in the role of the asking side.
 
     A protocol implements ``encode``, ``read``, ``answers`` and ``accept``, sets ``frame_end`` and, in ``opened``, asks
     for what begins the conversation. Raise ProtocolError in ``read`` for a frame that is no message.
@@ -131,7 +131,7 @@ class ExchangeSession(Session[M]):
     answer_s = 0.2
     """Seconds that an answer may take."""
     busy_after = 2
-    """Failures in a row after which the robot takes no commands."""
+    """Failures in a row after which the robot accepts no commands."""
     lost_after = 10
     """Failures in a row after which the session ends."""
 
@@ -144,27 +144,27 @@ class ExchangeSession(Session[M]):
 
     @abstractmethod
     def read(self, frame: bytes) -> M:
-        """Read one frame; raise ProtocolError where it is no message. ``exchange.awaited`` is the request."""
+        """Read one frame; raise ProtocolError if it is no message. ``exchange.awaited`` is the request."""
 
     @abstractmethod
     def answers(self, request: bytes, message: M) -> bool:
-        """Tell whether a message is the answer to the request on the wire."""
+        """Return whether a message is the answer to the request on the wire."""
 
     def expects(self, request: bytes) -> bool:
-        """Tell whether a request is answered at all."""
+        """Return whether a request is answered at all."""
         return True
 
     def unasked(self, message: M) -> bool:
-        """Tell whether the robot may send a message without a request."""
+        """Return whether the robot may send a message without a request."""
         return False
 
     def unanswered(self, request: bytes, now: float) -> None:
-        """Learn that a request failed; it is not sent again unless this method does so."""
+        """Handle a failed request; it is not sent again unless this method does so."""
 
     # What a protocol's own code calls
 
     def poll(self, slot: str, request: M, now: float, period_s: float) -> None:
-        """Send a request now and then every ``period_s`` seconds; a newer one of the same slot replaces it."""
+        """Send a request now, and again every ``period_s`` seconds; a newer one of the same slot replaces it."""
         self.outbox.set(slot, (self.encode(request),), now, period_s=period_s)
 
     def unpoll(self, slot: str) -> None:
@@ -174,7 +174,7 @@ class ExchangeSession(Session[M]):
     # How a session does it
 
     def decode(self, frame: bytes) -> M:
-        """Read one frame and complete the request that it answers; raise ProtocolError where it answers none."""
+        """Read one frame and complete the request that it answers; raise ProtocolError if it answers none."""
         message = self.read(frame)
         awaited = self.exchange.awaited
         if awaited is not None and self.answers(awaited, message):
@@ -185,11 +185,11 @@ class ExchangeSession(Session[M]):
         return message
 
     def timers(self) -> float:
-        """Tell when the request on the wire fails. A protocol with timers of its own takes the earlier."""
+        """Return when the request on the wire fails. A protocol with timers of its own takes the earlier."""
         return self.exchange.answer_at
 
     def on_timer(self, now: float) -> None:
-        """Let the request on the wire fail if its time is up."""
+        """Fail the request on the wire if its time is up."""
         request = self.exchange.expire(now)
         if request is None:
             return

@@ -20,7 +20,7 @@ Action = Callable[[Any, float], object]
 
 
 class Handshake(Kept, Generic[Step, Event]):
-    """One run through a table. ``within_s``: seconds that a step may last; a step that is not in it may last for ever.
+    """One run through a table. ``within_s``: seconds that a step may last; a step that is not in it may last forever.
 
     ``timeout``: the event of a step that has lasted too long.
     """
@@ -46,7 +46,7 @@ class Handshake(Kept, Generic[Step, Event]):
         return f"<Handshake {self.step}>"
 
     def export(self, budget: Budget | None = None) -> Exported:
-        """Write the step, and how long it may last."""
+        """Export the step, and how long it may last."""
         return super().export(budget) | {"step": getattr(self.step, "name", self.step)}
 
     def restore(self, state: Exported) -> None:

@@ -1,15 +1,15 @@
-"""What an object hands on to the same object of another process, as values that MessagePack holds. Sans-IO.
+"""The state that an object hands over to the same object of another process, as values for MessagePack. Sans-IO.
 
-Theory of operation. A class names in ``kept`` the attributes that make its state, each with its type. ``export`` writes
-them, ``restore`` puts them into an object that was just made from the same settings. What a class does not name, its
-constructor makes anew. An attribute that is :class:`Kept` itself is restored in place. Times need no conversion: all
+Theory of operation. A class lists in ``kept`` the attributes that make up its state, each with its type. ``export``
+writes them, ``restore`` sets them in an object newly made from the same settings. The constructor makes all other
+attributes. An attribute that is :class:`Kept` itself is restored in place. Times need no conversion: all
 processes of a machine share the clock of their event loops.
 
-A state of another form (a field too few, another type, a name that an enumeration lacks) is refused whole.
+A state of another form (a missing field, another type, an unknown member of an enumeration) is rejected as a whole.
 
 A gateway also deposits its state every second, for a successor if the process dies. Such a deposit has a
-:class:`Budget`: what a class names as :class:`Spare` is left out where it is large, and the successor's object keeps
-what its constructor made.
+:class:`Budget`: large values of attributes marked as :class:`Spare` are left out, and the successor's object keeps what
+its constructor made.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ Exported = dict[str, Any]
 
 
 class Form(NamedTuple):
-    """How one attribute is written, and read back; for what no type describes."""
+    """How one attribute is written and read back, if no type describes it."""
 
     write: Callable[[Any], Any]
     read: Callable[[Any], Any]
 
 
 class Spare(NamedTuple):
-    """An attribute that a deposit may lack where its value is large. form: its type, or a :class:`Form`."""
+    """An attribute that a deposit omits if its value is large. form: its type, or a :class:`Form`."""
 
     form: Any
 
@@ -51,7 +51,7 @@ class Budget:
         return f"<Budget {self.most_bytes}, {len(self.left_out)} left out>"
 
     def admits(self, name: str, value: Any) -> bool:
-        """Tell whether a value is written; note it if not."""
+        """Return whether a value is written; note it if not."""
         flat = isinstance(value, bytes | bytearray | None)
         size = len(value or b"") if flat else len(msgspec.msgpack.encode(value))
         if size > self.most_bytes:
@@ -60,7 +60,7 @@ class Budget:
 
 
 class Frame(bytes):
-    """A frame of a kind of its own; every other frame is plain bytes. Subclasses keep their kind when handed on."""
+    """A frame of a special kind; all others are plain bytes. Subclasses keep their kind in a handover."""
 
     kinds: ClassVar[dict[str, type[bytes]]] = {"": bytes}
 

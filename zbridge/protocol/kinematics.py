@@ -28,7 +28,7 @@ class Differential(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     turn_full_rad_s: Positive = 1.0
 
     def sides_m_s(self, drive: Drive) -> tuple[float, float]:
-        """Give the speeds of the left and the right side over ground, m/s.
+        """Return the speeds of the left and the right side over ground, m/s.
 
         Raise Unsupported for a drive that only moves sideways; a sideways part beside others is left out.
         """
@@ -39,7 +39,7 @@ class Differential(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         return along_m_s - across_m_s, along_m_s + across_m_s
 
     def drive(self, left_m_s: float, right_m_s: float) -> Drive:
-        """Give the drive that makes the two sides this fast; scaled down to full scale where they are faster."""
+        """Return the drive that makes the two sides this fast; scaled down to full scale where they are faster."""
         forward = (left_m_s + right_m_s) / 2 / self.speed_full_m_s
         turn = (right_m_s - left_m_s) / self.track_m / self.turn_full_rad_s
         scale = max(1.0, abs(forward), abs(turn))
@@ -54,5 +54,5 @@ class Factors(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     turn: Factor = 0.0
 
     def value(self, drive: Drive) -> float:
-        """Give the value of the motor for a drive, in the motor's unit."""
+        """Return the value of the motor for a drive, in the motor's unit."""
         return drive.forward * self.forward + drive.left * self.left + drive.turn * self.turn

@@ -9,7 +9,7 @@ _VERSION = re.compile(r"\d{1,9}(\.\d{1,9})*")
 
 
 def parse_versions(listed: str) -> tuple[str, ...]:
-    """Read a comma-separated version list; leave out the entries that are no dotted numbers."""
+    """Read a comma-separated version list; ignore entries that are not dotted numbers."""
     entries = (entry.strip() for entry in listed.split(","))
     return tuple(entry for entry in entries if _VERSION.fullmatch(entry))
 

@@ -26,7 +26,7 @@ def parse_networks(key: str, texts: Iterable[str]) -> tuple[Network, ...]:
 def is_among(host: str, networks: Collection[Network]) -> bool:
     """Return whether a peer's address, as its socket gives it, lies in one of the networks.
 
-    An IPv4 peer of an IPv6 socket is its IPv4 address; a zone (``%eth0``) says nothing.
+    An IPv4 peer of an IPv6 socket is its IPv4 address; a zone (``%eth0``) is ignored.
     """
     address = ipaddress.ip_address(host.partition("%")[0])
     address = getattr(address, "ipv4_mapped", None) or address
@@ -34,7 +34,7 @@ def is_among(host: str, networks: Collection[Network]) -> bool:
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether a host, a name or an address, is this machine for certain."""
+    """Return whether a host (a name or an address) is certainly this machine."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:

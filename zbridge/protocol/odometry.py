@@ -1,4 +1,4 @@
-"""Odometry: the pose of a robot, added up from what its wheels have turned. Sans-IO."""
+"""Odometry: the pose of a robot, integrated from the rotation of its wheels. Sans-IO."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ class Odometry:
         return f"<Odometry x={self._x:.3f} y={self._y:.3f} heading={self._heading:.3f}>"
 
     def restart(self) -> None:
-        """Take the next positions as those of the present pose: the robot's counters may have been reset."""
+        """Treat the next positions as those of the current pose: the robot's counters may have been reset."""
         self._sides_m = None
 
     def sides(self, left_m: float, right_m: float, stamp_ns: int) -> Pose:
-        """Give the pose for the ways the two sides have made since their counters began, metres."""
+        """Return the pose for the distances that the two sides have covered since their counters began, metres."""
         left_before, right_before = self._sides_m or (left_m, right_m)
         self._sides_m = (left_m, right_m)
         left, right = left_m - left_before, right_m - right_before
         return self.moved((left + right) / 2, (right - left) / self._track_m, stamp_ns)
 
     def moved(self, way_m: float, turned_rad: float, stamp_ns: int) -> Pose:
-        """Give the pose after a way of ``way_m`` on which the robot turned by ``turned_rad``, counter-clockwise."""
+        """Return the pose after a path of ``way_m`` on which the robot turned by ``turned_rad``, counter-clockwise."""
         along = self._heading + turned_rad / 2
         self._x += way_m * math.cos(along)
         self._y += way_m * math.sin(along)

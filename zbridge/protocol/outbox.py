@@ -1,15 +1,13 @@
 """What a session still has to write: one frame at a time, with a gap between two writes. Sans-IO.
 
-Theory of operation
--------------------
-A session puts frames in. The driver takes one with ``take(now)``, writes it, reports the write with ``written(now)``
-and comes back at ``deadline()``. Fragile peers take one read as one packet, so ``take`` gives nothing for ``gap_s``
-after a write.
+Theory of operation ------------------- A session puts frames in. The driver gets one with ``take(now)``, writes it,
+reports the write with ``written(now)`` and returns at ``deadline()``. Fragile peers treat one read as one packet, so
+``take`` returns None for ``gap_s`` after a write.
 
-Four places for frames. ``take`` looks at them in this order:
+Four places for frames. ``take`` serves them in this order:
 
     exempt   queue of the handshake (``put_exempt``). The only one that is served during a silence (``quiet``).
-    urgent   queue of the stop (``set`` with ``urgent``). Each group leaves whole and in its order, whatever replaces
+    urgent   queue of the stop (``set`` with ``urgent``). Each group leaves whole and in order, whatever replaces
              its slot meanwhile. The same group is not queued twice.
     slots    one named group of frames each (``set``): the newest motion, the newest scan. A new group replaces the one
              before it, sent or not. Sent when due; with a period, again after each period, until ``until``.
@@ -17,7 +15,7 @@ Four places for frames. ``take`` looks at them in this order:
 
 Fairness: the slot that has been due longest goes first; slots and queue take turns frame by frame, so that neither
 a stream of motion nor a full queue starves the other. A group that replaces one of the same length continues at the
-position of the old one: if a group of motors is replaced faster than it is written, each motor still has its turn.
+position of the old one: if a group of motors is replaced faster than it is written, each motor is still served.
 
 Bounds: queue and exempt refuse a frame beyond ``limit``; urgent keeps the newest ``URGENT`` frames; a slot holds one
 group, and a protocol names a fixed number of slots.
@@ -54,7 +52,7 @@ class _Group:
         self.spacing_s = spacing_s
 
     def step(self, now: float) -> bytes:
-        """Give the next frame of the group."""
+        """Return the next frame of the group."""
         frame = self.frames[self.position]
         self.position += 1
         if self.position == len(self.frames):
@@ -119,7 +117,7 @@ class Outbox(Kept):
         self._quiet_until = until
 
     def mute(self, muted: bool) -> None:
-        """Drop everything but exempt frames, what waits and what comes, until ``mute(False)``."""
+        """Drop all frames but exempt ones, waiting or new, until ``mute(False)``."""
         self._muted = muted
         if muted:
             for place in (self._queue, self._urgent, self._slots):
@@ -132,7 +130,7 @@ class Outbox(Kept):
         self._exempt.append(frame)
 
     def withdraw(self, frame: bytes) -> bool:
-        """Take back an exempt frame (this object); False if it has left."""
+        """Remove an exempt frame (this object); False if it has left."""
         waiting = [kept for kept in self._exempt if kept is not frame]
         found = len(waiting) < len(self._exempt)
         self._exempt = deque(waiting)
@@ -174,9 +172,9 @@ class Outbox(Kept):
             new.position = old.position
 
     def prolong(self, slot: str, frames: tuple[bytes, ...], *, period_s: float, until: float) -> bool:
-        """Repeat what ``slot`` holds until then, at the times it has anyway; False where it holds other frames.
+        """Repeat what ``slot`` holds until then, on its existing schedule; False if it holds other frames.
 
-        Frames that somebody says again and again so leave evenly: a peer that reads seldom joins what comes closer.
+        So repeated frames leave evenly spaced: a peer that reads seldom joins frames that arrive closer together.
         """
         group = self._slots.get(slot)
         if group is None or group.frames != frames or group.due > until:
@@ -185,7 +183,7 @@ class Outbox(Kept):
         return True
 
     def forget(self) -> None:
-        """Drop every frame that waits, and every repetition."""
+        """Drop every waiting frame, and every repetition."""
         for place in (self._queue, self._urgent, self._exempt, self._slots):
             place.clear()
 
@@ -199,7 +197,7 @@ class Outbox(Kept):
             self._queue.remove(frame)
 
     def is_set(self, slot: str) -> bool:
-        """Tell whether ``slot`` holds a group."""
+        """Return whether ``slot`` holds a group."""
         return slot in self._slots
 
     def take(self, now: float) -> bytes | None:
@@ -233,7 +231,7 @@ class Outbox(Kept):
         return frame
 
     def deadline(self) -> float | None:
-        """Give the time at which :meth:`take` has a frame; None: all queues and slots are empty."""
+        """Return the time at which :meth:`take` has a frame; None: all queues and slots are empty."""
         if self._exempt:
             return self._free_at
         free_at = max(self._free_at, self._quiet_until)
@@ -244,12 +242,12 @@ class Outbox(Kept):
         return max(free_at, min(group.due for group in self._slots.values()))
 
     def due(self, now: float) -> bool:
-        """Tell whether :meth:`take` may have a frame now."""
+        """Return whether :meth:`take` may have a frame now."""
         at = self.deadline()
         return at is not None and at <= now
 
     def _hurries(self, group: tuple[bytes, ...]) -> bool:
-        """Tell whether a group still waits among the urgent frames, whole and in its order."""
+        """Return whether a group still waits among the urgent frames, whole and in its order."""
         if len(group) == 1:
             return group[0] in self._urgent
         urgent = tuple(self._urgent)
@@ -259,7 +257,7 @@ class Outbox(Kept):
         """Choose the slot that has been due longest; None: none is due, or it is the queue's turn."""
         if not self._slots:
             return None
-        if len(self._slots) == 1 and not self._queue:  # nearly always, for an HQ program that is shown a robot
+        if len(self._slots) == 1 and not self._queue:  # nearly always, for HQ programs
             slot, group = next(iter(self._slots.items()))
             return slot if group.due <= now else None
         due = [slot for slot, group in self._slots.items() if group.due <= now]

@@ -35,7 +35,7 @@ Translate = Callable[[Any, int], Iterable[Telemetry]]
 
 
 class Outcome(msgspec.Struct, frozen=True):
-    """What a command led to: telemetry to publish, and what of the command the robot cannot do, in words."""
+    """The outcome of a command: telemetry to publish, and which part of the command the robot cannot do, in words."""
 
     telemetry: tuple[Telemetry, ...] = ()
     left_out: str | None = None
@@ -44,7 +44,7 @@ class Outcome(msgspec.Struct, frozen=True):
 class RobotSide(Kept, ABC):
     """One robot as its protocol sees it: makes the sessions of its links, and translates both ways. Sans-IO.
 
-    Commands are put into the outbox of the sessions that this object made. The time is an argument.
+    Commands are put into the outboxes of the sessions that this object made. The time is an argument.
     """
 
     dialect: ClassVar[str | None] = None
@@ -66,7 +66,7 @@ class RobotSide(Kept, ABC):
 
     @abstractmethod
     def translator(self, kind: type) -> Translate:
-        """Give the function that translates messages of one class; asked once for each class."""
+        """Return the function that translates messages of one class; asked once for each class."""
 
     def telemetry(self, message: Any, stamp_ns: int) -> Iterable[Telemetry]:
         """Translate one message of the robot; raise ProtocolError if it has no meaning."""
@@ -81,43 +81,43 @@ class RobotSide(Kept, ABC):
         """Send the robot its stop before anything else, and repeat it until ``until``; once if ``until`` is ``now``."""
 
     def was_autonomous(self) -> None:
-        """Note that the robot was told to move by itself, perhaps by another gateway: every stop must end that too.
+        """Record that the robot was ordered to move by itself, perhaps by another gateway: stops must end that too.
 
-        Called once that is known, before the first session too. Override where a stop alone does not end it.
+        Called once that is known, even before the first session. Override if a stop alone does not end it.
         """
         return
 
     @property
     def idle_stop_s(self) -> float:
-        """Most seconds between two stops while nobody drives; ``inf``: as many as the configuration says."""
+        """Most seconds between two stops while nobody drives; ``inf``: as the configuration says."""
         return math.inf
 
     def stop_frames(self) -> tuple[bytes, ...]:
-        """Give the frames of a stop as the driving session would write them now; change nothing.
+        """Return the frames of a stop as the driving session would write them now; change nothing.
 
-        Somebody else writes them if this process dies. Empty: nobody can stop the robot then.
+        The supervisor writes them if this process dies. Empty: nobody can stop the robot then.
         """
         return ()
 
     @abstractmethod
     def ask(self, topic: Topic) -> None:
-        """Ask the robot for what it publishes on ``topic``; raise Refused if it cannot be asked."""
+        """Request from the robot what it publishes on ``topic``; raise Refused if that is not possible."""
 
     def known(self, topic: Topic) -> FleetMessage | None:
-        """Give the answer to a query for ``topic`` that is known already; None: :meth:`ask` the robot."""
+        """Return the answer to a query for ``topic`` that is known already; None: :meth:`ask` the robot."""
         return None
 
     @property
     def on_demand(self) -> tuple[Topic, ...]:
-        """Topics that the robot measures only while somebody listens; :meth:`listened` is told when."""
+        """Topics that the robot measures only while somebody subscribes; see :meth:`listened`."""
         return ()
 
     def listened(self, topic: Topic, on: bool) -> None:
-        """Switch an on-demand topic: the first listener came (``on``), or the last one went. Raise Refused."""
+        """Switch an on-demand topic: the first subscriber appeared (``on``), or the last one left. Raise Refused."""
         raise Unsupported(f"{topic.path} needs no listener")
 
     def begun(self, stamp_ns: int) -> tuple[Telemetry, ...]:
-        """Start with a connection that was just established; give the telemetry that is known at once."""
+        """Start with a newly established connection; return the telemetry that is known at once."""
         return ()
 
     @property
@@ -140,13 +140,13 @@ class RobotUser(typing.Protocol):
 
     @property
     def silent_s(self) -> float:
-        """Seconds for which the client's machine has owed an acknowledgement."""
+        """Seconds for which the client's machine has not acknowledged anything."""
 
     def repeat(self) -> None:
-        """Send the robot again what the client has in motion, unless neutral is owed."""
+        """Send the robot the client's motion again, unless neutral is needed."""
 
     def let_go(self, why: str) -> None:
-        """Give the robot back; the client must send neutral before it drives again."""
+        """Release the robot; the client must send neutral before it drives again."""
 
 
 class HqSide(Kept, ABC):
@@ -177,7 +177,7 @@ class HqSide(Kept, ABC):
 
     @abstractmethod
     def show(self, topic: Topic, message: FleetMessage) -> Send | None:
-        """Translate what is new of the robot; None: no client is told."""
+        """Translate news of the robot; None: no client is notified."""
 
     @abstractmethod
     def take(self, session: Any, message: Any) -> Iterable[Telemetry]:
@@ -185,22 +185,22 @@ class HqSide(Kept, ABC):
 
     def answer(self, session: Any, topic: Topic, message: FleetMessage | None, now: float) -> None:
         """Answer a client's query; ``message`` None: the robot gave no answer. Raise Refused, EncodeError."""
-        raise Unsupported(f"nothing can be asked for {topic.path}")
+        raise Unsupported(f"{topic.path} cannot be queried")
 
     def tell(self, session: Any, text: str, now: float) -> None:
         """Show a text to the people at a client, if the protocol can."""
         return
 
     def presence(self, there: bool) -> Send | None:
-        """Show that the robot is there, or is lost; None: no client is told."""
+        """Show that the robot is present, or lost; None: no client is notified."""
         return None
 
     def deadline(self, session: Any) -> float:
-        """Give the time of the next :meth:`expire` for a client; ``inf``: never."""
+        """Return the time of the next :meth:`expire` for a client; ``inf``: never."""
         return math.inf
 
     def expire(self, session: Any, now: float) -> Iterable[Telemetry]:
-        """Translate what a client sent earlier and what waited for a deadline."""
+        """Translate messages of a client that waited for a deadline."""
         return ()
 
     def wanted(self) -> tuple[Topic, ...]:
@@ -208,7 +208,7 @@ class HqSide(Kept, ABC):
         return ()
 
     def numbers(self, clients: int) -> ClientIds:
-        """Make the numbers that clients are given, at most ``clients`` at a time; 1 and up unless overridden."""
+        """Make the source of client numbers, at most ``clients`` at a time; 1 and up unless overridden."""
         return ClientIds(range(1, clients + 1), quiet_s=0.0)
 
     def initial_commands(self) -> tuple[Telemetry, ...]:
@@ -218,12 +218,12 @@ class HqSide(Kept, ABC):
     def is_motion(self, command: Drive | Motor) -> bool:
         """Return whether a command of this protocol's programs is motion, False for neutral.
 
-        What a side calls neutral although it sets something (wheels) is carried out only for who drives the robot.
+        A neutral that still sets something (wheels) is carried out only for the program that drives the robot.
         """
         return command.moving
 
     def attend(self, client: RobotUser) -> None:
-        """ReadPayload after a client that holds the robot; called every :data:`ATTEND_S`.
+        """Attend to a client that holds the robot; called every :data:`ATTEND_S`.
 
         Legacy programs repeat their motion, or the deadman ends it. For those that set it once, override this.
         """
@@ -231,7 +231,7 @@ class HqSide(Kept, ABC):
 
 
 class HqSimulation(msgspec.Struct, frozen=True):
-    """How a simulated HQ program is started. It is as fragile as legacy ones. ``address``: where it connects.
+    """The start options of a simulated HQ program. It is as fragile as legacy ones. ``address``: where it connects.
 
     ``drive``: forward and turn that it drives once it has sent neutral, fractions of full scale; None: none.
     """
@@ -244,10 +244,10 @@ class HqSimulation(msgspec.Struct, frozen=True):
 
 
 class Simulation(msgspec.Struct, frozen=True):
-    """How a simulated robot is started. ``addresses``: where it listens, one for each link, in the links' order.
+    """The start options of a simulated robot. ``addresses``: where it listens, one for each link, in the links' order.
 
-    ``ready`` is called with the addresses that are bound. A protocol raises ConfigError for what it does not have
-    (versions, dialects, datagrams, a second link).
+    ``ready`` is called with the bound addresses. A protocol raises ConfigError for what it does not support (versions,
+    dialects, datagrams, a second link).
     """
 
     addresses: tuple[Address, ...]
@@ -273,11 +273,11 @@ class Protocol(msgspec.Struct, frozen=True):
     links: int
     """Most links of a robot."""
     robot: Callable[[Any, int, Metrics], RobotSide]
-    """``robot(options, links, metrics)``: the device side of a robot with so many links (1 to ``Protocol.links``)."""
+    """``robot(options, links, metrics)``: the robot side, for ``links`` links (1 to ``Protocol.links``)."""
     simulate: Callable[[Simulation], Coroutine[Any, Any, None]]
     """Run a simulated robot until cancelled."""
     simulated: dict[str, Any] = {}
-    """Options that fit the simulated robot; empty: the defaults do."""
+    """Options that fit the simulated robot; empty: the defaults fit."""
     hq: Callable[[Any, RobotView, Metrics], HqSide] | None = None
     """``hq(options, view, metrics)``: the HQ side; None: the protocol has no listeners."""
     hq_options: type[msgspec.Struct] = _NoOptions
@@ -310,14 +310,14 @@ def protocol_names() -> tuple[str, ...]:
 
 
 def find_protocol(name: str) -> Protocol:
-    """Find an installed protocol; raise ConfigError that lists the installed ones, or says why it cannot be loaded."""
+    """Find an installed protocol; raise ConfigError that lists the installed ones, or says why it fails to load."""
     where = find_entry_point(GROUP, name)
     if where is None:
         raise ConfigError(f"protocol = {name!r}: expected one of {', '.join(protocol_names()) or '(none installed)'}")
     module, _, attributes = where.partition(":")
     try:
         protocol = operator.attrgetter(attributes)(import_module(module))
-    except (Exception, SystemExit) as error:  # of a foreign package: it must not end what serves other protocols
+    except (Exception, SystemExit) as error:  # of a foreign package: it must not affect other protocols
         raise ConfigError(f"protocol = {name!r}: {where} cannot be loaded: {describe(error)}") from error
     if isinstance(protocol, Protocol):
         return protocol

@@ -1,8 +1,8 @@
-"""Frames of a link that is a Zenoh session: what a session declares and puts there, and what comes of it. Sans-IO.
+"""Frames of a link that is a Zenoh session: what a session declares and puts there, and what it receives. Sans-IO.
 
-A protocol whose robots speak plain Zenoh says ``Protocol(keyed=True)``. Its sessions then write and read these frames
-where others write and read bytes; :mod:`zbridge.transport.samples` carries them out. Everything else stays as it is:
-outbox, limits, states, taps.
+A protocol whose robots speak plain Zenoh declares ``Protocol(keyed=True)``. Its sessions then write and read these
+frames where others write and read bytes; :mod:`zbridge.transport.samples` carries them out. Everything else stays as it
+is: outbox, limits, states, taps.
 
 =========== ==================================================== ==============================================
 written     SUBSCRIBE, WATCH and ANNOUNCE declare until the      ``key``: an expression; ANNOUNCE: a liveliness
@@ -33,7 +33,7 @@ SAMPLE_BYTES = 16 * 2**20
 
 
 class SampleKind(IntEnum):
-    """What a frame says."""
+    """The kind of a frame."""
 
     SUBSCRIBE = 1
     WATCH = 2
@@ -49,7 +49,7 @@ class SampleKind(IntEnum):
 
 
 class KeyedSample(msgspec.Struct, frozen=True):
-    """One frame. stamp_ns: when it came, Unix nanoseconds; of what is written 0."""
+    """One frame. stamp_ns: when it was received, Unix nanoseconds; 0 in written frames."""
 
     kind: SampleKind
     key: str = ""
@@ -59,7 +59,7 @@ class KeyedSample(msgspec.Struct, frozen=True):
 
     @property
     def count(self) -> int:
-        """The number of samples that DROPPED tells of; raises ProtocolError where it tells none."""
+        """The number of samples that DROPPED reports; raises ProtocolError if it has none."""
         if len(self.payload) != _COUNT.size:
             raise ProtocolError(f"DROPPED of {len(self.payload)} bytes: expected {_COUNT.size}")
         return int(_COUNT.unpack(self.payload)[0])
@@ -76,27 +76,27 @@ def dropped(count: int) -> KeyedSample:
 
 
 def write_sample(sample: KeyedSample) -> bytes:
-    """Write a frame; raise EncodeError where key, attachment or payload is too long."""
+    """Write a frame; raise EncodeError if key, attachment or payload is too long."""
     key, attachment = sample.key.encode(), sample.attachment
     shown = attachment or b""
     size = _HEADER.size + len(key) + len(shown) + len(sample.payload)
     if len(key) >= _NONE or len(shown) >= _NONE or size > SAMPLE_BYTES:
         raise EncodeError(f"{sample.key[:80]}: sample of {size} bytes, attachment of {len(shown)}")
-    told = _NONE if attachment is None else len(shown)
-    return b"".join((_HEADER.pack(size, sample.kind, len(key), told, sample.stamp_ns), key, shown, sample.payload))
+    extra = _NONE if attachment is None else len(shown)
+    return b"".join((_HEADER.pack(size, sample.kind, len(key), extra, sample.stamp_ns), key, shown, sample.payload))
 
 
 def read_sample(frame: bytes) -> KeyedSample:
-    """Read a frame; raise ProtocolError where it is none."""
+    """Read a frame; raise ProtocolError if it is none."""
     if sample_end(frame, 0) != len(frame):
         raise ProtocolError(f"sample of {len(frame)} bytes is cut off")
-    _, kind, key_bytes, told, stamp_ns = _HEADER.unpack_from(frame)
+    _, kind, key_bytes, extra, stamp_ns = _HEADER.unpack_from(frame)
     shown_at = _HEADER.size + key_bytes
-    payload_at = shown_at + (0 if told == _NONE else told)
+    payload_at = shown_at + (0 if extra == _NONE else extra)
     try:
         key = frame[_HEADER.size : shown_at].decode()
         return KeyedSample(
-            SampleKind(kind), key, frame[payload_at:], None if told == _NONE else frame[shown_at:payload_at], stamp_ns
+            SampleKind(kind), key, frame[payload_at:], None if extra == _NONE else frame[shown_at:payload_at], stamp_ns
         )
     except ValueError as error:
         raise ProtocolError(f"sample of {len(frame)} bytes: {error}") from error
@@ -106,7 +106,7 @@ def sample_end(data: bytes, start: int) -> int:
     """Find the end of the frame at ``start``; the framing function of these sessions."""
     if len(data) - start < _HEADER.size:
         return start + _HEADER.size
-    size, _, key_bytes, told, _ = _HEADER.unpack_from(data, start)
-    if size < _HEADER.size + key_bytes + (0 if told == _NONE else told):
+    size, _, key_bytes, extra, _ = _HEADER.unpack_from(data, start)
+    if size < _HEADER.size + key_bytes + (0 if extra == _NONE else extra):
         raise ProtocolError(f"sample of {size} bytes with a key of {key_bytes}")
     return start + int(size)

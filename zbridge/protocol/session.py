@@ -38,12 +38,12 @@ from zbridge.wire.frames import FrameBuffer, FrameEnd
 M = TypeVar("M")
 
 Tap = Callable[[str, bytes], None]
-"""``tap("in" or "out", frame)``: is shown every frame while it is set; a :class:`Datagram` where it went by one."""
+"""``tap("in" or "out", frame)``: called with every frame while it is set; a :class:`Datagram` if it went by one."""
 
 LINGER_S = 0.5
 """Seconds that a closing session waits for its last frames to be written."""
 DOUBTS = 2
-"""So many doubts about a connection forbid motion; one alone may be an accident."""
+"""Doubts about a connection that together forbid motion; one alone may be an accident."""
 
 
 class Role(Enum):
@@ -54,7 +54,7 @@ class Role(Enum):
 
 
 _ESTABLISHED, _CLOSING, _CLOSED = State.ESTABLISHED, State.CLOSING, State.CLOSED
-"""Every message is compared with these; a lookup in the class is slow in Python 3.11."""
+"""Every message is compared with these; looking them up in the class is slow in Python 3.11."""
 
 
 class Session(KeptSession, ABC, Generic[M]):
@@ -74,7 +74,7 @@ class Session(KeptSession, ABC, Generic[M]):
         self.state = State.CONNECTING
         self.reason: str | None = None
         self.busy: str | None = None
-        """Why the peer takes no commands now although the session is established; None: it takes them."""
+        """Why the peer accepts no commands now although the session is established; None: it accepts them."""
         self.doubts: tuple[str, ...] = ()
         """Signs that the connection loses or alters what is sent on it."""
         self.version: str | None = None
@@ -97,42 +97,42 @@ class Session(KeptSession, ABC, Generic[M]):
 
     @abstractmethod
     def encode(self, message: M) -> bytes:
-        """Write a message as one frame; raise EncodeError where it cannot be."""
+        """Write a message as one frame; raise EncodeError if it cannot be."""
 
     @abstractmethod
     def decode(self, frame: bytes) -> M:
-        """Read one frame; raise ProtocolError where it is none of this protocol's messages."""
+        """Read one frame; raise ProtocolError if it is none of this protocol's messages."""
 
     def opened(self, now: float) -> None:
         """Take the first step of the handshake."""
 
     @abstractmethod
     def accept(self, message: M, now: float) -> bool:
-        """Handle a message of the handshake, or of a class in ``handled``; True hands it on to the translator."""
+        """Handle a message of the handshake, or of a class in ``handled``; True passes it on to the translator."""
 
     def claims(self, datagram: bytes, port: int) -> bool:
-        """Tell whether a datagram from a port of the peer's host that is nobody's source yet is from the peer."""
+        """Return whether a datagram from a port of the peer's host that is nobody's source yet is from the peer."""
         return False
 
     def rivalled(self, now: float) -> None:
         """React to a second source, or session, with the same claim; the peer has no source of datagrams any more."""
 
     def stray(self, datagram: bytes) -> None:
-        """ReadPayload at a datagram of the peer's host that nobody claimed; raise Refused to tell the peer why."""
+        """Inspect a datagram of the peer's host that nobody claimed; raise Refused to notify the peer."""
 
     def timers(self) -> float:
-        """Give the time of the next :meth:`on_timer`; ``inf``: never."""
+        """Return the time of the next :meth:`on_timer`; ``inf``: never."""
         return math.inf
 
     def on_timer(self, now: float) -> None:
         """Run the protocol's own timers that are due."""
 
     def undated(self, frame: bytes) -> bytes:
-        """Give a written frame without what each writing changes, as numbers and times; for the conformance kit."""
+        """Return a written frame without what each writing changes, as numbers and times; for the conformance kit."""
         return frame
 
     def overdue(self) -> str:
-        """Give the reason for a handshake that was not finished in time."""
+        """Return the reason for a handshake that was not finished in time."""
         return f"no handshake within {self.limits.handshake_s:g} s"
 
     # What a driver calls
@@ -142,7 +142,7 @@ class Session(KeptSession, ABC, Generic[M]):
         self._on(SessionEvent.OPEN, now=now)
 
     def receive(self, data: bytes, now: float) -> list[M]:
-        """Take bytes in any cut; give the messages for the translator, also those before a broken frame."""
+        """Receive bytes, cut anywhere; return the messages for the translator, also those before a broken frame."""
         messages: list[M] = []
         established = self.state is _ESTABLISHED
         if not established and self.over:
@@ -180,7 +180,7 @@ class Session(KeptSession, ABC, Generic[M]):
         return messages
 
     def receive_datagram(self, datagram: bytes, now: float) -> list[M]:
-        """Take one datagram, which is one frame; give its message for the translator."""
+        """Receive one datagram, which is one frame; return its message for the translator."""
         if self.over:
             return []
         if not self._allowance.take(now):
@@ -204,14 +204,14 @@ class Session(KeptSession, ABC, Generic[M]):
         return []
 
     def accept_datagram(self, message: M, now: float) -> bool:
-        """Handle a message that came by datagram; True hands it on to the translator."""
+        """Handle a message that came by datagram; True passes it on to the translator."""
         return self.accept(message, now)
 
     def _flooded(self) -> None:
         self.fail(f"flood: more than {self.limits.rate_hz:g} messages a second")
 
     def malformed(self, what: str) -> None:
-        """Count a message of the peer that is malformed; ``what`` says how."""
+        """Count a malformed message of the peer; ``what`` describes it."""
         self.traffic.malformed += 1
         self.last_malformed = what
 
@@ -230,9 +230,9 @@ class Session(KeptSession, ABC, Generic[M]):
         return frame
 
     def deadline(self, *, writing: bool = True) -> float | None:
-        """Give the time of the next :meth:`expire` and :meth:`outgoing`; None: never.
+        """Return the time of the next :meth:`expire` and :meth:`outgoing`; None: never.
 
-        ``writing`` False leaves out the frames that wait: the link takes nothing now.
+        ``writing`` False leaves out waiting frames: the link is stalled now.
         """
         if self.state is _CLOSED:
             return None
@@ -250,7 +250,7 @@ class Session(KeptSession, ABC, Generic[M]):
             self._on(SessionEvent.OVERDUE, self.overdue())
 
     def close(self, reason: str, now: float) -> None:
-        """End the conversation from our side once the frames that wait are written."""
+        """End the conversation from our side once the waiting frames are written."""
         self._on(SessionEvent.CLOSE, reason, now)
 
     def lost(self, reason: str) -> None:
@@ -280,7 +280,7 @@ class Session(KeptSession, ABC, Generic[M]):
             self._on(SessionEvent.AGREED)
 
     def lift_limit(self) -> None:
-        """Let the handshake take longer than its time limit: the protocol's own timers watch it from here."""
+        """Lift the time limit of the handshake: the protocol's own timers watch it from here."""
         self._limit_at = math.inf
 
     def send(self, message: M) -> None:
@@ -292,7 +292,7 @@ class Session(KeptSession, ABC, Generic[M]):
         self.outbox.put_exempt(self.encode(message))
 
     def snapshot(self) -> SessionEntry:
-        """Show the session as it is now, for the session table."""
+        """Describe the session as it is now, for the session table."""
         return SessionEntry(
             name=self.name,
             peer=self.peer,

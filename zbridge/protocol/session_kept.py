@@ -1,4 +1,4 @@
-"""What of a session survives a restart of the gateway. Sans-IO."""
+"""The part of a session that survives a restart of the gateway. Sans-IO."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from zbridge.wire.frames import FrameBuffer, Partial
 PARTIAL = "partial"
 """The name of the incomplete frame in a state."""
 SKIPPED = "the rest of a frame whose beginning was lost with a gateway"
-"""What a session counts among what it left out."""
+"""What a session counts as left out."""
 
 
 class KeptSession(Kept):
-    """The part of a session that another process can take over; a protocol names in ``kept`` what is its own."""
+    """The part of a session that another process can take over; a protocol adds its own attributes to ``kept``."""
 
     kept: ClassVar[dict[str, Any]] = {
         "state": State,
@@ -52,13 +52,13 @@ class KeptSession(Kept):
         return state | {PARTIAL: list(self._frames.partial() or ())} if budget is None else state
 
     def partial(self, most_bytes: int) -> Partial | None:
-        """Describe the incomplete frame in ``most_bytes`` at most; None where that is not possible."""
+        """Describe the incomplete frame in ``most_bytes`` at most; None if that is not possible."""
         return self._frames.partial(most_bytes)
 
     def restore(self, state: Exported) -> None:
         """Take over the state of the same session of another process; raise ProtocolError if it has another form.
 
-        To be called in place of :meth:`open`, on a session that was just made from the same settings.
+        Call it instead of :meth:`open`, on a session newly made from the same settings.
         """
         super().restore(state)
         try:

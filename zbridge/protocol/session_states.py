@@ -52,9 +52,9 @@ class SessionAction(Enum):
     SETTLE = "settle"
     """Lift the time limit."""
     LEAVE = "leave"
-    """Keep the reason; start the time limit for the last frames."""
+    """Record the reason; start the time limit for the last frames."""
     END = "end"
-    """Keep the first reason."""
+    """Record the first reason."""
 
 
 TRANSITIONS: dict[State, dict[SessionEvent, tuple[SessionAction, State]]] = {

@@ -31,7 +31,7 @@ class Backoff:
         return f"<Backoff next {self._next_s:g} s>"
 
     def delay_s(self) -> float:
-        """Give the next delay, seconds."""
+        """Return the next delay, seconds."""
         delay_s, self._next_s = self._next_s, min(self._most_s, 2 * self._next_s)
         return delay_s * (0.75 + 0.5 * self._chance())
 
@@ -54,7 +54,7 @@ class ClientIds(Kept):
         return f"<ClientIds {taken} of {len(self._free_at)} taken>"
 
     def take(self, now: float) -> int | None:
-        """Give the lowest id that is free now; None: all are taken."""
+        """Return the lowest id that is free now; None: all are taken."""
         for client_id, free_at in self._free_at.items():
             if free_at <= now:
                 self._free_at[client_id] = math.inf
@@ -62,13 +62,13 @@ class ClientIds(Kept):
         return None
 
     def keep(self, client_ids: Collection[int], now: float) -> None:
-        """Take back all ids but these: their clients are gone."""
+        """Release all ids but these: their clients are gone."""
         for client_id, free_at in self._free_at.items():
             if free_at == math.inf and client_id not in client_ids:
                 self.release(client_id, now)
 
     def release(self, client_id: int, now: float, *, rests: bool = True) -> None:
-        """Take an id back. ``rests`` False: the client never used it, so it is free at once."""
+        """Release an id. ``rests`` False: the client never used it, so it is free at once."""
         self._free_at[client_id] = now + self._quiet_s if rests else -math.inf
 
 
@@ -83,7 +83,7 @@ class SessionTable:
         return f"<SessionTable {len(self._live)} live, {len(self._ended)} ended>"
 
     def add(self, session: Session[Any]) -> None:
-        """Take a new session into the table."""
+        """Add a new session to the table."""
         self._live[session] = None
 
     def remove(self, session: Session[Any]) -> None:

@@ -36,7 +36,7 @@ class Traffic(msgspec.Struct):
     foreign: int = 0
     """Datagrams from other sources than the peer."""
     dropped: int = 0
-    """Frames that found no place in the queue."""
+    """Frames dropped because the queue was full."""
     refused: int = 0
     """Commands of the peer that were not carried out."""
     unanswered: int = 0

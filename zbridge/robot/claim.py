@@ -72,7 +72,7 @@ class Claim(msgspec.Struct, frozen=True):
         )
 
     def better_than(self, other: Claim, zid: str, other_zid: str) -> bool:
-        """Tell whether this claim, of the session ``zid``, is better than another one's."""
+        """Return whether this claim, of the session ``zid``, is better than another one's."""
         first, second = (each.rank for each in (self, other))
         if first != second:
             return first > second
@@ -104,7 +104,7 @@ _UNREADABLE = (msgspec.MsgspecError, UnicodeError, RecursionError)
 
 
 def read_question(payload: bytes) -> ClaimQuestion | None:
-    """Read who asks for claims; None where that cannot be read."""
+    """Read who asks for claims; None if that cannot be read."""
     with contextlib.suppress(*_UNREADABLE):
         return _read_question(payload)
     return None
@@ -144,7 +144,7 @@ class OtherGateways:
             return True
         self._without_claim = self._without_claim + 1 if token else 0
         if self._without_claim == LOOKS:
-            self._say("there is a token of a gateway of %s and no gateway that answers: it is ignored")
+            self._say("a gateway of %s has a token but does not answer: ignoring it")
         return 0 < self._without_claim < LOOKS
 
     def close_until(self, now: float) -> float:

@@ -51,7 +51,7 @@ class Commands:
         self._awaiting: _Awaiting | None = None
         """A mode that is carried out once it is written down."""
         self.blocked = False
-        """Whether the robot's link takes nothing: drives are not written, all other commands are refused."""
+        """Whether the robot's link is stalled: drives are not written, all other commands are refused."""
         self._topics = {context.keys.key(topics.CMD_DRIVE.path): topics.CMD_DRIVE}
         self._taken = context.metrics.count("commands")
         self._unwritten = context.metrics.count("drives_unwritten")
@@ -80,7 +80,7 @@ class Commands:
         self._enforcer.settle()
 
     def require_ready(self) -> Session[object]:
-        """Return the session that takes commands; raise Refused where the robot takes none now."""
+        """Return the session that takes commands; raise Refused if the robot takes none now."""
         session = self._robot.driving
         if session is None or (session.state is not _ESTABLISHED and session.over):
             raise NotReady("offline")
@@ -89,7 +89,7 @@ class Commands:
         return session
 
     def require_flowing(self) -> None:
-        """Raise Refused where the robot's link takes nothing: what waits for it would come after the stop."""
+        """Raise Refused if the robot's link is stalled: what waits for it would come after the stop."""
         if self.blocked:
             raise NotReady(LINK_BLOCKED)
 
@@ -143,13 +143,13 @@ class Commands:
         self._enforcer.settle()
 
     def _require_allowed(self, command: FleetMessage, sender: CommandSender | None) -> None:
-        """Raise Refused where a command that is no drive must not reach the robot now."""
+        """Raise Refused if a command that is no drive must not reach the robot now."""
         session = self.require_ready()
         self.require_flowing()
         if sender is not None and (isinstance(command, Raw) or _is_autonomous(command)):
             self._enforcer.require_fresh(sender)
             _require_sure(session)
-            self._enforcer.require_motion()
+            self._enforcer.check_motion()
 
     def _command(self, topic: Topic, command: FleetMessage, now: float, sender: CommandSender | None) -> None:
         self._show(topic, self._tell(topic, command, now), sender)
@@ -187,7 +187,7 @@ class Commands:
         try:
             outcome = self._robot.command(topic, command, now)
             if outcome is None:
-                raise TypeError("RobotSide.command gave no Outcome")
+                raise TypeError("RobotSide.command returned no Outcome")
         except (Refused, PayloadError, EncodeError):
             raise
         except Exception as error:
@@ -207,7 +207,7 @@ def _is_autonomous(command: FleetMessage) -> bool:
 
 
 def _require_sure(session: Session[object]) -> None:
-    """Raise Refused where the robot is not to be set in motion: a later stop might not arrive."""
+    """Raise Refused if the robot is not to be set in motion: a later stop might not arrive."""
     doubt = session.doubtful
     if doubt is not None:
         raise NotReady(doubt)

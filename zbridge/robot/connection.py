@@ -27,7 +27,7 @@ from zbridge.transport.fair_share import FairShare
 log = logging.getLogger("zbridge.link")
 
 Connect = Callable[[DeviceAddress, Conversation], Any]
-"""``await connect(address, receiver)``: raises LinkError where there is no connection to be had."""
+"""``await connect(address, receiver)``: raises LinkError if there is no connection to be had."""
 Attach = Callable[[DeviceAddress, Exported, Parcel, Conversation], Any]
 """``await attach(address, state, parcel, receiver)``: raises ProtocolError, OSError."""
 
@@ -93,7 +93,7 @@ class Links:
         self._connections.append(connection)
 
     def conversation(self, name: str) -> Conversation | None:
-        """Return the conversation over the link of this name; None where there is none."""
+        """Return the conversation over the link of this name; None if there is none."""
         return next((each.conversation for each in self._connections if each.name == name), None)
 
     def pump(self) -> None:
@@ -184,7 +184,7 @@ class Connection:
 
     @property
     def blocker(self) -> str | None:
-        """Why the link cannot be handed to another process now; None where it can, or where there is none."""
+        """Why the link cannot be handed to another process now; None if it can, or where there is none."""
         conversation = self.conversation
         if conversation is None:
             return None
@@ -214,7 +214,7 @@ class Connection:
                 self.conversation.lost(str(error))
 
     def export(self, parcel: Parcel, budget: Budget | None = None) -> Exported | None:
-        """Put the connection into a parcel, and describe its conversation; None where there is none."""
+        """Put the connection into a parcel, and describe its conversation; None if there is none."""
         return self.conversation.export(parcel, budget) if self.conversation is not None else None
 
     def restore(self, state: Exported | None, parcel: Parcel) -> None:

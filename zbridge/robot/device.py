@@ -67,7 +67,7 @@ _LOOK_S = 0.005
 """Seconds between two looks whether the links can be handed over."""
 
 
-class Device(Transferable):
+class RobotDevice(Transferable):
     """One robot on the bus; ``run`` serves it. addresses: one for each of the robot's links."""
 
     def __init__(
@@ -170,7 +170,7 @@ class Device(Transferable):
         )
 
     def __repr__(self) -> str:
-        return f"<Device {self._context.keys.robot} {self._links.first.state}>"
+        return f"<RobotDevice {self._context.keys.robot} {self._links.first.state}>"
 
     async def run(self, begin: Callable[[], Awaitable[None]] | None = None) -> None:
         """Serve the robot until cancelled; then stop it if it moves, and take leave of it.
@@ -235,7 +235,7 @@ class Device(Transferable):
         return self._links.first.state
 
     def last_stop(self) -> LastStop:
-        """Give what stops the robot now; see :class:`LastStop`."""
+        """Return what stops the robot now; see :class:`LastStop`."""
         session, driven, state = self._context.robot.driving, self.driven, self.state
         if self._aside or session is None or session.state is not State.ESTABLISHED:
             return LastStop(driven, state=state)
@@ -250,12 +250,12 @@ class Device(Transferable):
         return LastStop(driven, stop, session.outbox.gap_s, state)
 
     def boundary(self, name: str) -> Boundary:
-        """Give where the outgoing stream of a link stands; see :class:`Boundary`."""
+        """Return where the outgoing stream of a link stands; see :class:`Boundary`."""
         conversation = self._links.conversation(name)
         return Boundary(conversation is not None and not conversation.stalled)
 
     def partial(self, name: str, most_bytes: int) -> Partial | None:
-        """Give the incomplete frame that came by a link; see :meth:`Session.partial`."""
+        """Return the incomplete frame that came by a link; see :meth:`Session.partial`."""
         conversation = self._links.conversation(name)
         return conversation.session.partial(most_bytes) if conversation is not None else None
 
@@ -391,7 +391,7 @@ class Device(Transferable):
         }
 
     def deposit(self, parcel: Parcel, budget: Budget) -> Exported | None:
-        """Describe what another process needs to resume if this one dies; None where it could not.
+        """Describe what another process needs to resume if this one dies; None if it could not.
 
         The incomplete frames are not described: :meth:`partial` tells them after each read.
         """

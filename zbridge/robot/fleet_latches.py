@@ -20,7 +20,7 @@ ASK_S = 1.0
 """Longest wait for the answers; a lease is granted after it whoever answered."""
 SPREAD_S = 1.0
 """After the bus has returned gateways ask within so many seconds, each at another moment."""
-_WAITS = "the fleet's latched stops are asked for"
+_WAITS = "querying the fleet's latched stops"
 
 
 class FleetLatchNews:

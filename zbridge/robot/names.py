@@ -20,7 +20,7 @@ class NameBudget:
         return f"<NameBudget {len(self._seen)} of {NAMES}>"
 
     def admit(self, name: str, now: float) -> bool:
-        """Tell whether a name may be published."""
+        """Return whether a name may be published."""
         self.expire(now)
         if name in self._seen:
             return True

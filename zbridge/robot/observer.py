@@ -55,13 +55,13 @@ class Observed(Protocol):
         """The state of the robot, as on ``status``."""
 
     def last_stop(self) -> LastStop:
-        """Give what stops the robot now."""
+        """Return what stops the robot now."""
 
     def boundary(self, name: str) -> Boundary:
-        """Give where the outgoing stream of the link of this name stands."""
+        """Return where the outgoing stream of the link of this name stands."""
 
     def partial(self, name: str, most_bytes: int) -> Partial | None:
-        """Give the incomplete frame that came by the link of this name; see :data:`Resume`."""
+        """Return the incomplete frame that came by the link of this name; see :data:`Resume`."""
 
 
 class Observer(Protocol):

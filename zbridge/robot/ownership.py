@@ -194,7 +194,7 @@ class Ownership:
             await asyncio.sleep(LOOK_S)
 
     async def watch(self, served: Served) -> None:
-        """ReadPayload for other gateways that serve the robot; return when the robot must be left to one of them."""
+        """Poll for other gateways that serve the robot; return when the robot must be left to one of them."""
         self._standing, self._merge = lambda: served.standing, served.merge
         if self._state is OwnershipState.YIELDED:
             await served.step_aside()
@@ -245,7 +245,7 @@ class Ownership:
         return bool(own.latches) and not self._was_asked and self._untold >= 0
 
     def export(self) -> Exported | None:
-        """Write the claim for a successor of this gateway; None where the robot is not owned."""
+        """Write the claim for a successor of this gateway; None if the robot is not owned."""
         if self._held_since is None:
             return None
         yielded = self._state is OwnershipState.YIELDED
@@ -355,7 +355,7 @@ class Ownership:
         self._asked.clear()
 
     async def _sees(self, others: OtherGateways) -> bool:
-        """ReadPayload for a token, and for the claim behind it."""
+        """Query for a token, and for the claim behind it."""
         token = bool(await self._bus.alive(self._keys.alive(_WHO)))
         claims = await self._claims() if token else {}
         serving = [claim for claim in claims.values() if claim.held_s]
@@ -420,7 +420,7 @@ class Ownership:
 
 
 _TURNS = {
-    OwnershipState.OWNING: "no other gateway serves it better: serving it again",
+    OwnershipState.OWNING: "no other gateway has a better claim: serving it again",
     OwnershipState.YIELDED: "another gateway serves it: leaving the robot alone, and staying connected",
 }
 

@@ -88,7 +88,7 @@ class Presence:
             self._stalls.value += 1
             log.warning("%s: %s", self._context.keys.robot, LINK_BLOCKED)
         else:
-            self._enforcer.require_neutral("the robot's link took nothing", stops=True)
+            self._enforcer.require_neutral("the robot's link stalled", stops=True)
 
     def publish_status(self) -> None:
         """Publish ``status`` as it is now."""

@@ -65,7 +65,7 @@ class RobotPublishers:
             publisher.put(payloads.encode(message))
 
     def get(self, topic: Topic) -> Publisher | None:
-        """Return the publisher of a topic; None where the robot has too many names."""
+        """Return the publisher of a topic; None if the robot has too many names."""
         path = topic.path
         publisher = self.known.get(path)
         if publisher is None:

@@ -36,7 +36,7 @@ class DevicePlan(msgspec.Struct, frozen=True):
     shares: bool = False
 
     def make_robot(self, metrics: Metrics) -> RobotSide:
-        """Make the device side; raise ConfigError where the protocol's own code cannot."""
+        """Make the device side; raise ConfigError if the protocol's own code cannot."""
         try:
             return self.protocol.robot(self.options, len(self.addresses), metrics)
         except Exception as error:

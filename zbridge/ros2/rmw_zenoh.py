@@ -23,7 +23,7 @@ _OUTSIDE = re.compile(r"[^A-Za-z0-9_]")
 
 
 def is_ros_name(name: str) -> bool:
-    """Tell whether this is the full name of a topic, a service or a namespace: ``/r1/scan``."""
+    """Return whether this is the full name of a topic, a service or a namespace: ``/r1/scan``."""
     return _NAME.fullmatch(name) is not None
 
 
@@ -46,7 +46,7 @@ def dds_type(ros_type: str) -> str:
 
 
 def ros_type(dds_type: str) -> str | None:
-    """Read a type as it stands in keys; None where it is none."""
+    """Read a type as it stands in keys; None if it is none."""
     match = _DDS.fullmatch(dds_type)
     return "/".join(match.groups()) if match is not None else None
 
@@ -94,7 +94,7 @@ class RosQoS(msgspec.Struct, frozen=True):
 
 
 def read_qos(text: str) -> RosQoS | None:
-    """Read the quality of service of a token; None where it is none. Only the first three fields are looked at."""
+    """Read the quality of service of a token; None if it is none. Only the first three fields are looked at."""
     parts = text.split(":")
     if len(parts) < 6:
         return None
@@ -258,7 +258,7 @@ def endpoints_of(domain: int, kind: Kind, name: str = "*") -> str:
 
 
 def read_token(token: str) -> Node | Endpoint | None:
-    """Read a token; None where it is none, or none that can be understood."""
+    """Read a token; None if it is none, or none that can be understood."""
     parts = token.split("/") if len(token) <= LONGEST else []
     if len(parts) < _NODE_PARTS or parts[0] != "@ros2_lv" or "" in parts:
         return None

@@ -1,13 +1,14 @@
 """Who may do what on a secure bus: one table, and the router's access rules made of it, in Zenoh's own form.
 
 The table is :data:`GRANTS`: for each role, which messages it may send on which keys; ``docs/security.md`` shows it.
-What it lacks is denied; nothing is denied by name, for a denial of ``@cmd/drive`` would not catch a put on ``@cmd/*``.
+What it lacks is denied. Nothing is denied by name, because a denial of ``@cmd/drive`` would not match a put on
+``@cmd/*``.
 
 Ingress rules confine: each member may send what the table grants, and nothing else. One egress rule is shared by all
 known members and is as wide as the widest key expression that anybody uses. A rule passes only what its key expression
-includes: narrow egress rules would lose stops with wildcards, gets, and the declarations of subscriptions with
-wildcards, without which publishers send nothing. A member receives only what it subscribed to or asked for, and ingress
-rules confine both. Knows no Zenoh: the rules are what JSON can hold.
+includes: narrow egress rules would drop stops with wildcards, gets, and the declarations of subscriptions with
+wildcards, without which publishers send nothing. A member receives only what it subscribed to or queried, and ingress
+rules confine both. Knows no Zenoh: the rules are plain JSON values.
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ from zbridge.security.roles import Member, Roles
 STOPS_HZ = 1000.0
 """Stops a second that one member may send to one robot.
 
-So many cost its gateway a few hundredths of a processor. A stop with wildcards counts for the first robot that it
-matches, and Zenoh drops it if that robot was sent one a moment ago: the moment must be short.
+That many cost its gateway a few hundredths of a processor. A stop with wildcards counts for the first robot that it
+matches, and Zenoh drops it if that robot was sent one just before: the interval must be short.
 """
 MESSAGE_BYTES = 16 * 1024 * 1024
-"""Bound of every other message: a large image. Zenoh's own is 1 GB for each session."""
+"""Most bytes of every other message: a large image. Zenoh's own bound is 1 GB per session."""
 _EVERYBODY = "everybody"
 _BOUNDED = ("put", "delete", "query", "reply")
 
@@ -50,7 +51,7 @@ class MessageKind(StrEnum):
 class Keys(Enum):
     """The classes of keys: key expressions below the realm.
 
-    ``{robot}``: a robot's name, or ``*``. ``{name}``: a member's name. What begins with ``@/`` is Zenoh's own.
+    ``{robot}``: a robot's name, or ``*``. ``{name}``: a member's name. Keys that begin with ``@/`` are Zenoh's own.
     """
 
     DATA = ("{robot}/**",)
@@ -82,7 +83,7 @@ class Keys(Enum):
 
 
 class Grant(msgspec.Struct, frozen=True):
-    """What may be sent on a class of keys. own: of the member's robots only, not of all."""
+    """What may be sent on a class of keys. own: only for the member's robots."""
 
     keys: Keys
     kinds: tuple[MessageKind, ...]
@@ -167,7 +168,7 @@ def column(member: Member) -> Column:
 
 
 def expressions(keys: Keys, realm: str, name: str, robots: Iterable[str]) -> Iterator[str]:
-    """Write a class of keys as key expressions, for a member's name and for these robots."""
+    """Return a class of keys as key expressions, for a member's name and these robots."""
     for path in keys.value:
         for robot in robots if "{robot}" in path else ("",):
             written = path.format(robot=robot, name=name)
@@ -210,7 +211,7 @@ def access_control(roles: Roles, realm: str) -> dict[str, Any]:
 
 
 def low_pass_filter(realm: str, most_bytes: int = MESSAGE_BYTES) -> list[dict[str, Any]]:
-    """Return Zenoh's ``low_pass_filter``: what comes in must be no larger than its class allows.
+    """Return Zenoh's ``low_pass_filter``: input must be no larger than its class allows.
 
     Commands and queries have the bounds of their keys, all else ``most_bytes`` (payload and attachment together).
     """
@@ -228,10 +229,10 @@ def low_pass_filter(realm: str, most_bytes: int = MESSAGE_BYTES) -> list[dict[st
 
 
 def downsampling(roles: Roles, realm: str, stops_hz: float = STOPS_HZ) -> list[dict[str, Any]]:
-    """Return Zenoh's ``downsampling``: so many stops a second of each member to each robot that ``roles.toml`` names.
+    """Return Zenoh's ``downsampling``: the stops per second of each member to each robot that ``roles.toml`` names.
 
-    Zenoh counts per link and rule and keeps the first: one rule on all robots would lose the stops of all but one. On
-    drives there must be no rule, since the first of a second is not the newest.
+    Zenoh counts per link and rule and keeps the first: one rule on all robots would lose the stops of all but one.
+    There must be no rule on drives, because the first of a second is not the newest.
     """
     robots = sorted({robot for member in roles.names.values() for robot in member.robots})
     if not robots:

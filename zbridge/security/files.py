@@ -1,4 +1,4 @@
-"""The files of a secure bus: where each is, written whole or not at all; keys for their owner alone."""
+"""The files of a secure bus: their paths, and atomic writing; keys are readable by their owner only."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _OTHERS = 0o077
 
 
 class NameFiles:
-    """The files of one name; a folder that holds them is what ``--tls`` takes."""
+    """The files of one name; ``--tls`` accepts a folder with them."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -42,7 +42,7 @@ class Folder:
 
 @contextlib.contextmanager
 def changing(folder: Folder) -> Iterator[None]:
-    """Keep other programs from changing the folder meanwhile; raise ConfigError if one does, or there is no folder."""
+    """Lock the folder against changes by other programs; raise ConfigError if it is locked, or does not exist."""
     try:
         descriptor = os.open(folder.path, os.O_RDONLY | os.O_DIRECTORY)
     except OSError as error:
@@ -57,15 +57,15 @@ def changing(folder: Folder) -> Iterator[None]:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder that only its owner may enter, if there is none yet; raise ConfigError."""
+    """Make a folder that only its owner may enter, if it does not exist; raise ConfigError."""
     with _named(path):
         path.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
 
 
 def write(path: Path, content: bytes, mode: int | None = None) -> None:
-    """Replace a file as a whole; raise ConfigError. A secret is never readable by others, not even meanwhile.
+    """Replace a file as a whole; raise ConfigError. A secret is never readable by others, not even temporarily.
 
-    mode: None: as the umask has it.
+    mode: None: as the umask sets it.
     """
     new = path.with_name(f".{path.name}.new")
     with _named(path):

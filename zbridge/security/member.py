@@ -1,6 +1,6 @@
-"""What a gateway's certificate is good for, before it is used: what is wrong with it, and what is to be warned of.
+"""Checks a gateway's certificate before it is used: errors, and warnings.
 
-Nothing here asks a router, and nothing needs the package ``cryptography``.
+Contacts no router, and does not need the package ``cryptography``.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from zbridge.security.roles import ROLES
 
 
 def check_member(plan: GatewayPlan) -> Certificate | None:
-    """Return the certificate of a gateway's bus, None without one; raise ConfigError for what no time will mend.
+    """Return the certificate of a gateway's bus, None without one; raise ConfigError for permanent faults.
 
-    That is: files that are not there, do not match, or can be read by others, and a role that does not fit.
+    These are: files that are missing, do not match, or can be read by others, and a role that does not fit.
     """
     tls = plan.config.bus.tls
     if tls is None:
@@ -38,7 +38,7 @@ def check_member(plan: GatewayPlan) -> Certificate | None:
 
 
 def not_checked(plan: GatewayPlan, certificate: Certificate) -> str:
-    """Return a note on what only the router can check."""
+    """Return a note about what only the router can check."""
     what = "serve" if plan.device is not None else "serve HQ programs of"
     return (
         f"not checked: whether the router knows {certificate.common_name} and lets it {what} {plan.config.robot.name}"
@@ -49,7 +49,7 @@ def _check_role(plan: GatewayPlan, tls: Tls, certificate: Certificate) -> None:
     needed = "gateway" if plan.device is not None else "hq"
     if certificate.role == needed or certificate.role not in ROLES:  # not ours: its rules are its owner's
         return
-    if plan.device is None and certificate.role == "gateway":  # one with listeners may do what an hq may
+    if plan.device is None and certificate.role == "gateway":  # one with listeners has the permissions of an hq
         return
     part = "[device]" if plan.device is not None else "[[hq]] and no [device]"
     raise ConfigError(

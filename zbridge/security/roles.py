@@ -1,8 +1,8 @@
 """The names that may use a secure bus, and the role of each: ``roles.toml``.
 
-``zbridge certs`` writes the file, and the router makes its access rules of it. Knows no certificate and no rule. The
-common name of a member's certificate is ``role.name``. A name has no dots: ``operator.op1.$*``, which stands in access
-rules for what belongs to op1, must not include what belongs to another name.
+``zbridge certs`` writes the file, and the router derives its access rules from it. Knows no certificate and no rule.
+The common name of a member's certificate is ``role.name``. A name has no dots: ``operator.op1.$*``, which stands in
+access rules for what belongs to op1, must not include what belongs to another name.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from zbridge.toml import as_toml, convert, prefixed, read_toml
 Role = Literal["viewer", "operator", "supervisor", "gateway", "hq", "recorder", "router"]
 ROLES: tuple[Role, ...] = get_args(Role)
 OF_ROBOTS: tuple[Role, ...] = ("gateway", "hq")
-"""Roles whose members name their robots; all other roles are for the whole fleet."""
+"""Roles that are limited to named robots; all other roles are for the whole fleet."""
 
 ROLES_BYTES = 16_000_000
 """Largest file of roles: a fleet's members have some 100 bytes each."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,47}")
 """With the longest role it fits the 64 characters of a common name."""
 _RESERVED = ("hq",)
-"""Names that nobody has: who may ask ``acquire/hq`` could ask as any listener, ``hq.<name>.<id>``."""
+"""Forbidden names: a member that may query ``acquire/hq`` could do so as any listener, ``hq.<name>.<id>``."""
 
 
 class Member(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a name is. robots: those of a gateway or an hq, at least one; no other role has any.
+    """The role of a name. robots: those of a gateway or an hq, at least one; no other role has any.
 
     listeners: a gateway whose process serves HQ programs too, so that it drives its robots for them.
     """
@@ -43,7 +43,7 @@ class Member(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Roles(msgspec.Struct, frozen=True):
-    """Who may use the bus. revoked: names that are gone, and that nobody is ever given again."""
+    """Who may use the bus. revoked: names that were revoked, and are never issued again."""
 
     names: dict[str, Member] = {}
     revoked: tuple[str, ...] = ()

@@ -1,8 +1,8 @@
-"""One Zenoh router process: opens it, answers members who they are, and logs who comes and whom Zenoh refuses and why.
+"""One Zenoh router process: opens it, tells members their roles, and logs who connects and whom Zenoh refuses, and why.
 
-Zenoh lets a certificate of its authority connect whatever the name, and an unknown name hears silence. So each member
-can ask ``<realm>/@bus/whoami/<name>``, which the access rules let only that name ask: no answer means that this router
-does not know the name.
+Zenoh accepts every certificate of its authority whatever the name, and an unknown name receives nothing. So each member
+can query ``<realm>/@bus/whoami/<name>``, which the access rules permit only to that name: no answer means that this
+router does not know the name.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from zbridge.toml import prefixed
 log = logging.getLogger("zbridge.security.router")
 
 FOLD_S = 10.0
-"""Seconds within which the same warning is logged once, with how often it came before."""
+"""Seconds within which the same warning is logged once, with its count."""
 KINDS = 64
-"""Different warnings that are counted apart; all others share one."""
+"""Most warnings that are counted separately; all others share one."""
 
 
 class Router:
@@ -41,7 +41,7 @@ class Router:
         return f"<Router {' '.join(self._plan.settings.listen)}>"
 
     async def run(self) -> None:
-        """Route until cancelled; raise ConfigError where an address or a TLS file cannot be used."""
+        """Route until cancelled; raise ConfigError if an address or a TLS file cannot be used."""
         settings = self._plan.settings
         with prefixed(f"no router at {', '.join(settings.listen)}: ", BusError):
             bus = await open_router(zenoh_values(self._plan), Metrics(), self.note)
@@ -68,7 +68,7 @@ class Router:
             log.info("%s connected from %s", name, neighbour.address)
 
     def answer(self, query: IncomingQuery) -> None:
-        """Tell a member who it is."""
+        """Answer a member's query for its role."""
         name = query.asked.rpartition("/")[2]
         member = self._plan.roles.names.get(name)
         if member is not None:
@@ -89,16 +89,16 @@ class Router:
 class ZenohWarnings:
     """Logs Zenoh's log in the terms of this project; :meth:`take` is called with each of its lines.
 
-    A peer that tries again and again would fill the log: the same warning is logged once in :data:`FOLD_S`.
+    A peer that retries forever would fill the log: the same warning is logged once in :data:`FOLD_S`.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._logged: dict[str, tuple[float, int]] = {}
-        """By warning, when it was logged, and how often it came since."""
+        """By warning, when it was logged, and its count since."""
 
     def take(self, line: str) -> None:
-        level, text = in_our_words(line)
+        level, text = translate_log_line(line)
         if text not in self._logged and len(self._logged) >= KINDS:
             text = "more kinds of Zenoh warnings than are counted apart"
         at, more = self._logged.get(text, (-FOLD_S, 0))
@@ -110,7 +110,7 @@ class ZenohWarnings:
         log.log(level, "%s%s", text, f" ({more} times more since it was last logged)" if more else "")
 
 
-def in_our_words(line: str) -> tuple[int, str]:
+def translate_log_line(line: str) -> tuple[int, str]:
     """Return the level and the text of one line of Zenoh's log."""
     for pattern, text in _WORDS:
         if re.search(pattern, line):

@@ -1,7 +1,7 @@
-"""What a router is: its TOML file or options, checked as a whole, and Zenoh's configuration made of them.
+"""The settings of a router: its TOML file or options, checked as a whole, and Zenoh's configuration made of them.
 
-With ``tls`` every member shows a certificate, and the rules of ``roles.toml`` confine it. Without it nobody is
-confined, so the router serves this machine only, unless it is told to be insecure. Every ConfigError names key, value
+With ``tls`` every member presents a certificate, and the rules of ``roles.toml`` limit it. Without it nobody is
+limited, so the router serves this machine only, unless it is set to be insecure. Every ConfigError names key, value
 and what was expected.
 """
 
@@ -27,9 +27,9 @@ from zbridge.toml import read_struct
 LISTEN = "tcp/127.0.0.1:7447"
 LISTEN_TLS = "tls/0.0.0.0:7447"
 _HEADROOM_BYTES = 65_536
-"""What a message is larger than its payload and attachment."""
+"""Bytes by which a message exceeds its payload and attachment."""
 NEW_HZ = 5
-"""New connections a second of one address. Each that fails keeps newcomers waiting for 100 ms."""
+"""New connections a second of one address. Each that fails delays newcomers by 100 ms."""
 BURST = 50
 """Connections that one address may open at once before that: machines that run many gateways reconnect together."""
 AT_A_TIME = 256
@@ -38,11 +38,11 @@ _TRANSPORTS = {"tcp": "tcp", "tls": "tcp", "ws": "tcp", "quic": "udp", "udp": "u
 
 
 class RouterLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """``[limits]``: what one member may ask of the router.
+    """``[limits]``: what one member may use of the router.
 
-    sessions: connections at a time; pending: connections that are being opened at a time, as after a restart, when all
-    members come at once. message_bytes: of payload and attachment, where no smaller bound holds. stops_hz:
-    stops a second of one member to one robot. opening_s: how long somebody who connects may take.
+    sessions: connections at a time; pending: connections being opened at a time, for example after a restart, when all
+    members connect at once. message_bytes: of payload and attachment, unless a smaller bound applies. stops_hz: stops a
+    second of one member to one robot. opening_s: time limit to open a connection.
     """
 
     sessions: Annotated[int, msgspec.Meta(ge=1, le=100_000)] = 2000
@@ -65,7 +65,7 @@ class RouterSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class RouterPlan(msgspec.Struct, frozen=True):
-    """A router's settings with the roles that they name: what a router starts from."""
+    """A router's settings with the roles that they name."""
 
     settings: RouterSettings
     roles: Roles = Roles()
@@ -81,7 +81,7 @@ def load_router(path: Path) -> RouterSettings:
 
 
 def plan_router(settings: RouterSettings, *, files: bool = True) -> RouterPlan:
-    """Check settings and read the roles that they name; raise ConfigError. files: whether TLS files must be there."""
+    """Check settings and read the roles that they name; raise ConfigError. files: whether TLS files must exist."""
     if not is_name(settings.realm):
         raise ConfigError(f"realm = {settings.realm!r}: expected letters, digits, '_', '.' and '-' only")
     if not settings.listen:
@@ -181,7 +181,7 @@ def _is_loopback(address: str) -> bool:
 
 
 def nftables(settings: RouterSettings) -> str:
-    """Return rules for ``nft -f``; raise ConfigError if the router listens at no port."""
+    """Return rules for ``nft -f``; raise ConfigError if the router has no port."""
     listening = {transport: ports for transport in ("tcp", "udp") if (ports := _ports(settings, transport))}
     if not listening:
         raise ConfigError(f"listen = {list(settings.listen)}: expected an address with a port")

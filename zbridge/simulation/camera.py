@@ -1,4 +1,4 @@
-"""A robot's camera to play with: streams drawn JPEGs as legacy robots do, MJPEG by HTTP at ``/stream.mjpg``."""
+"""A simulated camera: streams drawn JPEGs as legacy robots do, MJPEG by HTTP at ``/stream.mjpg``."""
 
 from __future__ import annotations
 
@@ -101,6 +101,6 @@ async def _stream(writer: asyncio.StreamWriter) -> None:
 
 
 def scene(number: int) -> bytes:
-    """Paint one picture as greys of its squares, row by row: a light that wanders over a slope."""
+    """Paint one picture as greys of its squares, row by row: a light that moves over a gradient."""
     light = number % (COLUMNS * ROWS)
     return bytes(255 if at == light else 40 + 6 * (at % COLUMNS) for at in range(COLUMNS * ROWS))

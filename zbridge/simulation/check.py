@@ -1,9 +1,9 @@
 """The conformance kit: ``python -m zbridge.simulation.check NAME`` checks an installed protocol.
 
-It prints one line for each thing that holds or does not, and exits with 0 where all hold and with 1 otherwise. The
+It prints one line per requirement, and exits with 0 if all hold, else with 1. The
 checks are in ``check_plugin`` (name, template), ``check_messages`` (what is read and written), ``check_sessions``
 (handshake, garbage, silence, end), ``check_commands`` (stop, commands) and ``check_motion`` (the simulated robot drives
-and stands). Knows no protocol.
+and stops). Knows no protocol.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from zbridge.simulation.check_stage import CheckFinding, Transcript, raised, rec
 
 USAGE = "usage: python -m zbridge.simulation.check NAME\n"
 ESTABLISH_S = 10.0
-"""Seconds that a session with the simulated robot has to be established."""
+"""Time limit to establish a session with the simulated robot, seconds."""
 
 
 def check(protocol: Protocol, name: str, *, establish_s: float = ESTABLISH_S) -> Iterator[CheckFinding]:
-    """Check a protocol, installed as ``name``; yield what holds and what does not, in the order of the checks."""
+    """Check a protocol, installed as ``name``; yield the findings in the order of the checks."""
     yield from check_plugin(protocol, name)
     yield from check_messages(protocol)
     recording = Transcript()
@@ -73,7 +73,7 @@ def main(arguments: list[str]) -> int:
 
 
 def check_plugin(protocol: Protocol, name: str) -> Iterator[CheckFinding]:
-    """Check what the gateway needs before the first connection. name: the entry point's."""
+    """Check what the gateway needs before the first connection. name: of the entry point."""
     other = f"the entry point is {name!r}, Protocol.name is {protocol.name!r}" if protocol.name != name else None
     yield CheckFinding("the protocol has the name of its entry point", other)
     yield CheckFinding.tried("the template is a configuration of this protocol", lambda: _template(protocol))
@@ -103,5 +103,5 @@ def _shown(protocol: Protocol) -> str | None:
 
 
 if __name__ == "__main__":
-    logging.disable(logging.CRITICAL)  # of this process alone: the findings say what is wrong
+    logging.disable(logging.CRITICAL)  # of this process only: the findings report what is wrong
     sys.exit(main(sys.argv[1:]))

@@ -20,7 +20,7 @@ from zbridge.simulation.check_stage import STEP_S, CheckFinding, Rehearsal, Tran
 STOP_S = 0.5
 """Seconds for which the stop is repeated."""
 WATCHED_S = 0.4
-"""Virtual seconds in which a command has to have an effect."""
+"""Virtual seconds within which a command must have an effect."""
 LATE_S = 0.1
 WAITING = b"what waits"
 MORE_FRAMES = 20
@@ -28,7 +28,7 @@ MORE_FRAMES = 20
 
 
 def check_stop(protocol: Protocol, recording: Transcript) -> Iterator[CheckFinding]:
-    """Check that the stop is the next thing written, and that motion that waits is not sent after it."""
+    """Check that the stop is written next, and that waiting motion is not sent after it."""
     for claim, find, expected in (
         ("the stop goes before all that waits, and no motion after it", _stop, "a stop that is put into the outbox"),
         ("a stop is repeated until its time is over", _repeated, "a stop that is put into the outbox"),
@@ -58,7 +58,7 @@ def _stop(protocol: Protocol, recording: Transcript) -> list[str]:
 
 
 def _crowd(protocol: Protocol, recording: Transcript, idle: set[bytes], taken: int) -> Rehearsal:
-    """Let commands, a request and polls wait. taken: how many are written then, as slots and the queue take turns."""
+    """Queue commands, a request and polls. taken: how many are then written, as slots and queue alternate."""
     queued = _established(protocol, recording)
     for topic, commands in _commands(protocol):
         for command in commands if topic is not topics.CMD_MODE else ():
@@ -92,7 +92,7 @@ def _repeated(protocol: Protocol, recording: Transcript) -> str | None:
 
 
 def check_commands(protocol: Protocol, recording: Transcript) -> Iterator[CheckFinding]:
-    """Check that every fleet command has an effect or is refused; a question likewise."""
+    """Check that every fleet command and query has an effect or is refused."""
     for topic, commands in _commands(protocol):
         claim = f"{topic.path} is carried out or refused with a code"
         obey = partial(_obeyed, protocol, recording, topic, commands, claim)
@@ -145,7 +145,7 @@ def _question(protocol: Protocol, recording: Transcript, topic: Topic) -> CheckF
 
 
 def _carry_out(rehearsal: Rehearsal, topic: Topic, command: FleetMessage) -> str:
-    """Give what became of a command; an empty text where nothing did."""
+    """Return the outcome of a command; empty if it had none."""
     idle = set(rehearsal.run(WATCHED_S))
     outcome = _give(rehearsal, topic, command)
     if outcome:
@@ -158,7 +158,7 @@ def _carry_out(rehearsal: Rehearsal, topic: Topic, command: FleetMessage) -> str
 
 
 def _give(rehearsal: Rehearsal, topic: Topic, command: FleetMessage) -> str:
-    """Give a command; tell its code where it is refused, and what it shows or leaves out."""
+    """Send a command; return its code if it is refused, and what it publishes or leaves out."""
     try:
         outcome = rehearsal.robot.command(topic, command, rehearsal.now)
     except Refused as refusal:

@@ -1,4 +1,4 @@
-"""Conformance of the simulated robot: it drives ahead, stands after its stop, and turns to the left."""
+"""Conformance of the simulated robot: it drives ahead, halts after its stop, and turns to the left."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ DRIVE_S = 1.0
 AGAIN_S = 0.1
 IDLE_S = 0.3
 STAND_S = 0.7
-"""Seconds after a stop in which the robot has to come to rest."""
+"""Seconds after a stop within which the robot must halt."""
 WATCHED_S = 1.2
 TURN_S = 0.6
 FORWARD, TURN = 0.4, 0.5
 FACTOR = 3.0
-"""A way or a turn is at most so much more, or less, than the options say."""
+"""Tolerance of a distance or a turn against the options."""
 TURNED_RAD = 0.02
 MOVED_M = 0.02
 MOVING = 0.05
@@ -32,7 +32,7 @@ MOVING = 0.05
 
 
 def check_motion(protocol: Protocol, establish_s: float) -> Iterator[CheckFinding]:
-    """Drive the simulated robot forward, then stop it, and see what it shows or what is written."""
+    """Drive the simulated robot forward, then stop it, and check what it shows or what is written."""
     try:
         yield from asyncio.run(_drive_and_stop(protocol, establish_s))
     except Exception as error:  # whatever the protocol's own code raises is a finding
@@ -65,7 +65,7 @@ async def _drive_and_stop(protocol: Protocol, establish_s: float) -> list[CheckF
 
 
 async def _turn(scene: Stage, clock: Callable[[], float], full_rad_s: float) -> CheckFinding:
-    """Turn to the left where the robot shows its heading; ``full_rad_s`` as in the options, 0 if unknown."""
+    """Turn to the left, if the robot shows its heading; ``full_rad_s`` as in the options, 0 if unknown."""
     claim = "a turn of the simulated robot is counter-clockwise"
     before = _Seen(scene).poses
     if not before:
@@ -88,20 +88,20 @@ async def _turn(scene: Stage, clock: Callable[[], float], full_rad_s: float) -> 
 
 
 def _full(protocol: Protocol, option: str) -> float:
-    """Give what the options say of full scale; 0 where they do not."""
+    """Return full scale according to the options; 0 if they do not state it."""
     value = getattr(msgspec.convert(protocol.simulated, protocol.options), option, 0.0)
     return value if isinstance(value, float) else 0.0
 
 
 def _unlike(seen: float, expected: float, unit: str) -> str | None:
-    """Tell whether a way or a turn is not what the options promise; ``expected`` 0: they promise nothing."""
+    """Return whether a distance or a turn contradicts the options; ``expected`` 0: they do not state it."""
     if not expected or expected / FACTOR <= seen <= expected * FACTOR:
         return None
     return f"{seen:.3f} {unit}, but the options say {expected:.3f} {unit}"
 
 
 async def _watch(scene: Stage, seconds: float, *, keep: bool = False) -> _Seen:
-    """Let the robot live; give what it showed. ``keep``: what it showed before counts too."""
+    """Run the robot; return what it showed. ``keep``: what it showed before counts too."""
     if not keep:
         scene.shown.clear()
         scene.frames.clear()
@@ -123,12 +123,12 @@ class _Seen:
 
     @property
     def way_m(self) -> float:
-        """How far ahead the robot is of where it was first, along the heading that it had; negative: behind."""
+        """Distance from the first position along the first heading; negative: behind."""
         first, last = self.poses[0], self.poses[-1]
         return (last.x - first.x) * math.cos(first.heading) + (last.y - first.y) * math.sin(first.heading)
 
     def moves(self, idle: _Seen, expected_m: float) -> CheckFinding:
-        """Tell whether it moved, or at least was commanded so."""
+        """Return whether it moved, or at least was commanded to."""
         claim = "the simulated robot drives"
         if not self.poses and not self.speeds:
             commanded = bool(self.written - idle.written)
@@ -142,7 +142,7 @@ class _Seen:
         return CheckFinding(claim, None, f"{self.way_m:.2f} m" if self.poses else "by its speed")
 
     def stands(self, stop: _Seen, drive: _Seen) -> CheckFinding:
-        """Tell whether it stood after the stop, or at least was commanded so."""
+        """Return whether it halted after the stop, or at least was commanded to."""
         claim = "the simulated robot stands after its stop"
         if not self.poses and not self.speeds:
             commanded = bool(stop.written - drive.written)

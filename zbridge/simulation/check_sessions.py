@@ -16,7 +16,7 @@ STEPS = 12
 SEEDS = 4
 GARBAGE_BYTES = 80
 STAMP_NS, STAMP_WITHIN_NS = 10**18, 10**10
-"""When the robot's messages come, and how far a stamp may be from it: a robot may have a clock of its own."""
+"""When the robot's messages arrive, and the tolerance of their stamps: a robot may have its own clock."""
 
 
 def check_sessions(protocol: Protocol, recording: Transcript) -> Iterator[CheckFinding]:
@@ -43,7 +43,7 @@ def check_sessions(protocol: Protocol, recording: Transcript) -> Iterator[CheckF
 
 
 def _steps(protocol: Protocol, recording: Transcript) -> list[int]:
-    """List after how many frames of the robot something goes wrong: 0, all of the handshake, and some between."""
+    """List the numbers of frames after which a fault occurs: 0, all of the handshake, and some between."""
     rehearsal = Rehearsal(protocol, recording)
     frames = rehearsal.establish()
     if rehearsal.session.state is not State.ESTABLISHED:
@@ -97,7 +97,7 @@ def _without_reason(rehearsal: Rehearsal) -> Iterator[str]:
 
 
 def _translated(protocol: Protocol, recording: Transcript) -> list[str]:
-    """Translate what the robot sent; telemetry has to be what its topic promises."""
+    """Translate what the robot sent; telemetry must have its topic's message."""
     robot, problems = robot_of(protocol), []
     for name in robot.link_names:
         robot.session(name, "tcp://robot.test:1")

@@ -1,8 +1,8 @@
-"""The stage of the conformance kit: a protocol's simulated robot on loopback, and rehearsals of what it said.
+"""The stage of the conformance kit: a protocol's simulated robot on loopback, and rehearsals of what it sent.
 
-:func:`record` runs the simulated robot and a conversation with each of its links, and keeps what was said. A
-:class:`Rehearsal` plays that to a new session without any link, in a time of its own: so each step of a handshake can
-go wrong on purpose, and hours pass at once.
+:func:`record` runs the simulated robot and a conversation with each of its links, and records them. A
+:class:`Rehearsal` plays the record to a new session without any link, in virtual time: so each step of a handshake can
+fail on purpose, and hours pass at once.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from zbridge.transport import Conversation, connect
 
 
 class CheckFinding(msgspec.Struct, frozen=True):
-    """One line of the report. ``problem`` None: the claim holds. ``note``: what a reader should know of it."""
+    """One line of the report. ``problem`` None: the claim holds. ``note``: a remark for the reader."""
 
     claim: str
     problem: str | None = None
@@ -33,7 +33,7 @@ class CheckFinding(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, claim: str, problems: list[str], note: str = "") -> CheckFinding:
-        """Make the finding of a claim that was tried in many ways: the first problems are shown."""
+        """Make the finding of a claim that was tested in many ways; it shows the first problems."""
         if not problems:
             return cls(claim, None, note)
         more = f" (and {len(problems) - _SHOWN} more)" if len(problems) > _SHOWN else ""
@@ -43,9 +43,9 @@ class CheckFinding(msgspec.Struct, frozen=True):
     def tried(
         cls, claim: str, find: Callable[[], str | list[str] | CheckFinding | None], expected: str = ""
     ) -> CheckFinding:
-        """Make the finding of a check that gives a problem, several, or none, or that ends with an exception.
+        """Make the finding of a check that returns a problem, several, or none, or raises an exception.
 
-        expected: what should have come instead of that.
+        expected: what should have happened instead.
         """
         try:
             found = find()
@@ -63,7 +63,7 @@ class CheckFinding(msgspec.Struct, frozen=True):
 
 
 def raised(error: BaseException, expected: str = "") -> str:
-    """Say what the protocol's own code raised, in which class and line, and what was expected instead."""
+    """Return what the protocol's own code raised, in which class and line, and what was expected instead."""
     return f"{describe(error)}; expected {expected}" if expected else describe(error)
 
 
@@ -73,7 +73,7 @@ _SHOWN = 3
 SHOWN_S = 1.0
 """Seconds that a recording continues after the session was established."""
 HANG_UP_S = 0.2
-"""Seconds that the simulated robot is given to see that its peer is gone."""
+"""Seconds for the simulated robot to detect that its peer is gone."""
 STEP_S = 0.01
 """Virtual seconds between two frames of a rehearsal."""
 _HANDLED = "ProtocolError for what a robot must not say, and no other exception"
@@ -83,7 +83,7 @@ _ANSWER_FRAMES = 8
 
 
 class Transcript(msgspec.Struct):
-    """What was said on the driving link, and whether all links were established. ``answers``: what followed a frame."""
+    """The frames of the driving link, and whether all links were established. ``answers``: what followed a frame."""
 
     received: list[bytes] = []
     answers: dict[bytes, list[bytes]] = {}
@@ -94,7 +94,7 @@ class Transcript(msgspec.Struct):
 
 
 def robot_of(protocol: Protocol) -> RobotSide:
-    """Make the device side as it fits the simulated robot."""
+    """Make the robot side that fits the simulated robot."""
     return protocol.robot(msgspec.convert(protocol.simulated, protocol.options), protocol.links, Metrics())
 
 
@@ -106,9 +106,9 @@ class Stage:
         self.robot = robot_of(protocol)
         self.sessions: list[Session[Any]] = []
         self.frames: list[tuple[str, bytes]] = []
-        """What was said on the first link: ``in`` or ``out``, and the frame."""
+        """The frames of the first link: ``in`` or ``out``, and the frame."""
         self.messages: list[Any] = []
-        """What the sessions handed on."""
+        """The messages that the sessions passed on."""
         self.shown: list[tuple[Topic, FleetMessage]] = []
         self._conversations: list[Conversation] = []
 
@@ -142,7 +142,7 @@ class Stage:
         return False
 
     def lacking(self, within_s: float) -> Iterator[str]:
-        """Say of each link that is not established what it is, or why its session ended."""
+        """Return for each link that is not established its state, or why its session ended."""
         for name, session in zip(self.robot.link_names, self.sessions, strict=True):
             which = f"link {name} ({type(session).__qualname__})"
             if session.over:
@@ -185,7 +185,7 @@ async def live(protocol: Protocol) -> AsyncIterator[Stage]:
 
 
 async def record(protocol: Protocol, establish_s: float) -> Transcript:
-    """Converse with the simulated robot until a while after all links are established; keep what was said."""
+    """Run the conversations until a while after all links are established; record them."""
     async with live(protocol) as scene:
         established = await scene.established(establish_s)
         if established:
@@ -201,7 +201,7 @@ async def record(protocol: Protocol, establish_s: float) -> Transcript:
 
 
 def _answers(frames: list[tuple[str, bytes]]) -> dict[bytes, list[bytes]]:
-    """Tell what the robot said after each frame and before the next one."""
+    """Return what the robot sent after each frame and before the next one."""
     answers: dict[bytes, list[bytes]] = {}
     asked = b""
     for direction, frame in frames:
@@ -225,13 +225,13 @@ class Rehearsal:
         self.session.open(self.now)
 
     def play(self, frames: list[bytes]) -> None:
-        """Let the robot say these frames, one after the other."""
+        """Play these frames of the robot, one after the other."""
         for frame in frames:
             self.run(STEP_S)
             self._hear(frame)
 
     def establish(self) -> int:
-        """Let the robot say what it said, until the session is established; give how many frames that took."""
+        """Play the robot's frames until the session is established; return how many frames that took."""
         for count, frame in enumerate(self._recording.received):
             self.run(STEP_S)
             if self.session.state is not State.HANDSHAKING:
@@ -241,9 +241,9 @@ class Rehearsal:
         return len(self._recording.received)
 
     def run(self, seconds: float, *, answers: bool = True) -> list[bytes]:
-        """Let time pass and write what is due; give what was written. Raise RuntimeError where that never ends.
+        """Advance the time and write what is due; return what was written. Raise RuntimeError if that never ends.
 
-        ``answers``: the robot says what it said after the same frame, once the session is established.
+        ``answers``: the robot repeats what it sent after the same frame, once the session is established.
         """
         written: list[bytes] = []
         end, session = self.now + seconds, self.session
@@ -265,7 +265,7 @@ class Rehearsal:
         raise RuntimeError(f"{_MOST_WRITES} writes and timers within {seconds:g} s")
 
     def _hear(self, frame: bytes) -> None:
-        """Let the session and the translation take what the robot says."""
+        """Pass the robot's frames to the session and the translation."""
         for message in self.session.receive(frame, self.now):
             with contextlib.suppress(ProtocolError):
                 list(self.robot.telemetry(message, 1))

@@ -56,7 +56,7 @@ class FragilePeer(Judge):
         return self._phase.name
 
     def _work(self) -> Iterable[Work]:
-        """Give the tasks to start with."""
+        """Return the tasks to start with."""
         return ()
 
     def _before_close(self) -> None:
@@ -181,7 +181,7 @@ class FragileServer(FragilePeer):
         """Begin to serve a connection."""
 
     def _free(self) -> bool:
-        """Tell whether the next connection is to be served."""
+        """Return whether the next connection is to be served."""
         return False
 
     def _bind(self, host: str, port: int, sockets: contextlib.ExitStack) -> socket.socket:

@@ -86,11 +86,11 @@ class HqProgram(FragilePeer):
     @property
     @abstractmethod
     def agreed(self) -> str:
-        """Say what was agreed, once the program can drive; until then an empty text."""
+        """Return what was agreed, once the program can drive; until then an empty text."""
 
     @abstractmethod
     def shown(self) -> str:
-        """Say what the robot shows it now."""
+        """Return what the robot shows it now."""
 
     @abstractmethod
     async def neutral(self) -> None:

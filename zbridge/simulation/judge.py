@@ -3,7 +3,7 @@
 A judge is a simulated peer as fragile as the legacy ones: it records each violation of what the page of its protocol
 demands, and dies of what kills or cripples the legacy programs. Section names in its docstrings are those of that
 page. Judges share their scaffold (this module, ``fragile``, ``hq_program``, ``sockets`` and ``timing``), and no code
-with the gateway that they judge, so that an error there cannot hide here: not its messages, session or translation.
+with the gateway that they judge, so that an error there cannot hide here.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ M = TypeVar("M")
 
 
 class Ended(Exception):
-    """A judge died, or has nothing left to do: raised to end its tasks. Without a text the end is no event."""
+    """Raised to end a judge's tasks: it died, or has nothing left to do. Without a text the end is no event."""
 
 
 class Judge:
@@ -42,14 +42,14 @@ class Judge:
         return deque(maxlen=self.KEEP)
 
     def _violate(self, text: str) -> None:
-        """Record what the protocol page forbids; beyond ``KEEP`` entries it is only noted."""
+        """Record a violation of the protocol page; beyond ``KEEP`` entries only notify."""
         if len(self.violations) < self.KEEP:
             self.violations.append(text)
         if self.note is not None:
             self.note(text)
 
     def _event(self, text: str) -> None:
-        """Record what happened and is no violation; dropped beyond ``KEEP`` entries."""
+        """Record an event that is no violation; dropped beyond ``KEEP`` entries."""
         if len(self.events) < self.KEEP:
             self.events.append(text)
 
@@ -60,7 +60,7 @@ class Judge:
         raise Ended(f"died: {text}")
 
     def _report(self, problem: str, raw: str, *, deadly: bool = False) -> bool:
-        """Record what is wrong with a message, if anything; tell whether something is. Raise Ended if it is deadly."""
+        """Record what is wrong with a message, if anything, and return whether there is. Raise Ended if it is fatal."""
         if deadly:
             self._die(f"{problem}: {raw}")
         if problem:
@@ -69,7 +69,7 @@ class Judge:
 
 
 class Chances(dict[str, random.Random]):
-    """One stream of random numbers for each thing that a peer leaves to chance, by name: none disturbs another."""
+    """A stream of random numbers for each random choice of a peer, by name: they do not influence each other."""
 
     def __init__(self, seed: int) -> None:
         super().__init__()
@@ -103,15 +103,15 @@ class MessageReader(Generic[M]):
         return messages
 
     def _lost(self, data: bytes) -> str:
-        """Tell why the length of the message at the start of ``data`` is unknowable, empty if it is not."""
+        """Return why the length of the message at the start of ``data`` is unknowable, empty if it is not."""
         raise NotImplementedError
 
     def _lose(self, problem: str, after: int) -> M:
-        """Give a message for what cannot be framed, ``after`` others in this read; set ``dead`` or clear ``rest``."""
+        """Return a message for what cannot be framed, ``after`` others in this read; set ``dead`` or clear ``rest``."""
         raise NotImplementedError
 
     def _size(self, data: bytes) -> int:
-        """Give the bytes of the message, or as many as are needed to know."""
+        """Return the bytes of the message, or as many as are needed to know."""
         raise NotImplementedError
 
     def _read(self, raw: bytes) -> M:
@@ -119,7 +119,7 @@ class MessageReader(Generic[M]):
 
 
 def show(data: bytes, limit: int = 60) -> str:
-    """Write bytes in hex for a sentence, the first ``limit`` of them."""
+    """Format the first ``limit`` bytes in hex."""
     return shorten(data[:limit].hex(" "), data, limit)
 
 

@@ -1,4 +1,4 @@
-"""Serves a simulated robot to the HQ programs that connect: links, conversations, and the steps of its life.
+"""Serves a simulated robot to the HQ programs that connect: links, conversations, and simulation steps.
 
 Uses the gateway's sessions and transport, unlike :mod:`zbridge.simulation.fragile`. Knows no bus and no protocol.
 """
@@ -23,7 +23,7 @@ from zbridge.transport import Accepted, Conversation, Link, listen
 STEP_S = 0.02
 """Seconds between two steps of a simulated robot, in its own time too."""
 CATCH_UP_S = 1.0
-"""Most seconds of its life that a robot makes up for after this process was late."""
+"""Most seconds that a robot catches up after this process was late."""
 
 M = TypeVar("M")
 
@@ -39,7 +39,7 @@ async def live(step: Callable[[int], None]) -> None:
 class Simulator(ABC, Generic[M]):
     """One simulated robot on its links. A protocol contributes :meth:`session`, :meth:`take` and :meth:`step`.
 
-    ``links``: one name for each address of the simulation. ``datagrams``: take datagrams on the number of the TCP port.
+    ``links``: one name for each address of the simulation. ``datagrams``: receive datagrams at the TCP port's number.
     """
 
     def __init__(self, log: logging.Logger, *, links: tuple[str, ...] = ("robot",), datagrams: bool = False) -> None:
@@ -51,7 +51,7 @@ class Simulator(ABC, Generic[M]):
 
     @abstractmethod
     def session(self, peer: str, link: str) -> Session[M] | None:
-        """Make the session for a connection to the link of this name; None closes it: no place is free."""
+        """Make the session for a connection to the link of this name; None closes it: the robot is full."""
 
     @abstractmethod
     def take(self, client: Conversation, message: M) -> None:
@@ -59,10 +59,10 @@ class Simulator(ABC, Generic[M]):
 
     @abstractmethod
     def step(self, steps: int) -> None:
-        """Live for :data:`STEP_S`, and tell what is due; ``steps`` counts from 1."""
+        """Simulate :data:`STEP_S`, and send what is due; ``steps`` counts from 1."""
 
     def greet(self, client: Conversation, link: str) -> None:
-        """Send what a new client gets first. Nothing that :meth:`tell` sends comes before it."""
+        """Send the first messages of a new client. Nothing that :meth:`tell` sends precedes them."""
 
     def dismiss(self, client: Conversation) -> None:
         """Forget a client whose conversation has ended."""
@@ -73,7 +73,7 @@ class Simulator(ABC, Generic[M]):
     # What a protocol calls
 
     def clients(self, link: str | None = None) -> Iterator[Conversation]:
-        """Give the clients whose sessions are established, of one link or of all."""
+        """Return the clients whose sessions are established, of one link or of all."""
         for client, name in tuple(self._clients.items()):
             if link in (None, name) and client.session.state is State.ESTABLISHED:
                 yield client
@@ -95,10 +95,10 @@ class Simulator(ABC, Generic[M]):
                 self._log.debug("%s: not sent, %s", session.name, error)
             client.pump()
 
-    # Life
+    # Running
 
     async def run(self, simulation: Simulation) -> None:
-        """Listen on each address and live until cancelled; then close every conversation."""
+        """Listen on each address and run until cancelled; then close every conversation."""
         async with contextlib.AsyncExitStack() as stack:
             addresses = [
                 await stack.enter_async_context(

@@ -1,4 +1,4 @@
-"""Plain sockets for judges: they decide themselves when to read, which no transport of the gateway lets them.
+"""Plain sockets for judges, which decide themselves when to read; no transport of the gateway allows that.
 
 All sockets are non-blocking. Knows no protocol.
 """
@@ -43,7 +43,7 @@ def bind_tcp_and_udp(host: str, port: int) -> tuple[socket.socket, socket.socket
 
 @contextlib.asynccontextmanager
 async def connected(host: str, port: int, options: Iterable[tuple[int, int, int]] = ()) -> AsyncIterator[socket.socket]:
-    """Connect, every write a segment of its own; ``options`` are set before; raise OSError where nobody listens."""
+    """Connect, every write a segment of its own; ``options`` are set before; raise OSError if nobody listens."""
     with socket.socket(_family(host)) as tcp:
         tcp.setblocking(False)
         send_at_once(tcp)
@@ -59,12 +59,12 @@ def send_at_once(tcp: socket.socket) -> None:
 
 
 def reset_on_close(tcp: socket.socket) -> None:
-    """Let the close of a connection reset it, as the loss of power would."""
+    """Make closing a connection reset it, as a power failure would."""
     tcp.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
 
 
 def drain(tcp: socket.socket) -> tuple[bytes, str]:
-    """Read all that is there; give it, and how the connection ended ("" while it is open)."""
+    """Read all that is there; return it, and how the connection ended ("" while it is open)."""
     data = b""
     for _ in range(_READS):
         try:
@@ -80,7 +80,7 @@ def drain(tcp: socket.socket) -> tuple[bytes, str]:
 
 
 async def readable(sock: socket.socket, most_s: float = math.inf) -> None:
-    """Wait until a read would give something, ``most_s`` at most; the same with asyncio's and uvloop's loop."""
+    """Wait until a read would return data, ``most_s`` at most; works with asyncio's and uvloop's loop."""
     loop = asyncio.get_running_loop()
     future: asyncio.Future[None] = loop.create_future()
     loop.add_reader(sock.fileno(), _wake, future)

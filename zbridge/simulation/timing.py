@@ -1,6 +1,6 @@
 """When simulated peers act and read, and how late their own process was. Knows no protocol.
 
-What a judge times is held against its peer only as far as the judge was not late itself.
+A judge holds a time against its peer only as far as the judge itself was not late.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _READ_BYTES = 65536
 _STAMPS = 35
 """SO_TIMESTAMPNS of Linux, which Python does not name."""
 STAMPED = ((socket.SOL_SOCKET, _STAMPS, 1),) if sys.platform == "linux" else ()
-"""Options of a socket whose reads tell when their last byte arrived."""
+"""Options of a socket whose reads report when their last byte arrived."""
 
 
 class Ticker:
@@ -52,31 +52,31 @@ class Ticker:
 
 
 class PollingReader:
-    """Reads a non-blocking connection whenever it is asked to, and tells how long it had not looked.
+    """Reads a non-blocking connection on request, and reports how long it had not polled.
 
     ``most_bytes``: of one read.
     """
 
     def __init__(self, tcp: socket.socket, most_bytes: int) -> None:
         self.unread_s = 0.0
-        """Longest time for which the last data may have waited: it was not there when this reader looked before."""
+        """Longest time for which the last data may have waited: it was not there at the previous poll."""
         self._tcp, self._most_bytes = tcp, most_bytes
         self._empty_at = time.monotonic()
 
     def poll(self) -> bytes | None:
         """Read without waiting: None if nothing is there, empty at the end of the stream; raise OSError."""
-        looked_at, data = time.monotonic(), None
+        polled_at, data = time.monotonic(), None
         with contextlib.suppress(BlockingIOError):
             data = self._tcp.recv(self._most_bytes)
             self.unread_s = time.monotonic() - self._empty_at
         if data is None or len(data) < self._most_bytes:
-            self._empty_at = looked_at
+            self._empty_at = polled_at
         return data
 
-    async def read(self, look_s: float) -> bytes:
-        """Read as soon as there is anything; look every ``look_s``, to know since when there was nothing."""
+    async def read(self, poll_s: float) -> bytes:
+        """Read as soon as there is data; poll every ``poll_s``, to know since when there was none."""
         while (data := self.poll()) is None:
-            await readable(self._tcp, look_s)
+            await readable(self._tcp, poll_s)
         return data
 
 
@@ -119,7 +119,7 @@ class ReadingThread(threading.Thread):
 
 
 def _stamp(stamps: Sequence[tuple[int, int, bytes]]) -> float:
-    """Give the time of day when the kernel took the last byte read; now where it does not tell."""
+    """Return the time of day when the kernel took the last byte read; now if it does not report it."""
     for level, kind, data in stamps:
         if (level, kind, len(data)) == (socket.SOL_SOCKET, _STAMPS, 16):
             seconds, nanoseconds = struct.unpack("qq", data)
@@ -128,7 +128,7 @@ def _stamp(stamps: Sequence[tuple[int, int, bytes]]) -> float:
 
 
 def _waited_s() -> float:
-    """Give how long this thread was ready to run without a processor so far; 0 where the system does not tell."""
+    """Return how long this thread was ready to run without a processor so far; 0 if the system does not report it."""
     with contextlib.suppress(OSError, ValueError, IndexError), open("/proc/thread-self/schedstat", "rb") as file:
         return int(file.read().split()[1]) * 1e-9
     return 0.0

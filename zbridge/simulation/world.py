@@ -27,7 +27,7 @@ class Box(msgspec.Struct, frozen=True):
     y_max: float
 
     def near(self, x: float, y: float, radius: float) -> bool:
-        """Tell whether a disc overlaps the box."""
+        """Return whether a disc overlaps the box."""
         dx = x - min(max(x, self.x_min), self.x_max)
         dy = y - min(max(y, self.y_min), self.y_max)
         return dx * dx + dy * dy < radius * radius

@@ -1,4 +1,4 @@
-"""The receiver of an accepted link, until there is a conversation, and after it."""
+"""The receiver of an accepted link, before and after its conversation."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Accepted(Receiver):
         return self._conversation is not None and self._conversation.claims(datagram, port)
 
     def rivalled(self) -> None:
-        """Tell the conversation of a second source, or conversation, with the same claim."""
+        """Notify the conversation of a second source, or conversation, with the same claim."""
         if self._conversation is not None:
             self._conversation.rivalled()
 

@@ -1,7 +1,7 @@
-"""Finds how long the oldest written byte has waited for its acknowledgement. Sans-IO.
+"""Measures how long the oldest written byte has waited for its acknowledgement. Sans-IO.
 
-A transport tells how many bytes are outstanding, not for how long. So each write is entered with its time, and removed
-when it is acknowledged; acknowledgements come in the order of the writes.
+A transport reports how many bytes are outstanding, not for how long. So each write is recorded with its time, and
+removed when it is acknowledged; acknowledgements come in the order of the writes.
 """
 
 from __future__ import annotations
@@ -9,26 +9,26 @@ from __future__ import annotations
 from collections import deque
 
 LEAST_S = 1e-9
-"""What a write has waited for at the moment when it is made, by any clock: 0 would mean that nothing waits."""
+"""The age of a write that was just made, by any clock: 0 would mean that nothing waits."""
 ENTRIES = 1024
-"""Writes with a time of their own; a write beyond takes the time of the last one."""
+"""Most writes with a time of their own; a further write shares the time of the last one."""
 
 
 class Backlog:
-    """The writes that are not known to be acknowledged."""
+    """The writes not known to be acknowledged."""
 
     def __init__(self) -> None:
         self._entries: deque[tuple[int, float]] = deque()
         """For each write: the bytes written up to its end, and when."""
         self._written = 0
         self.since: float | None = None
-        """When the oldest byte was written that is not known to be acknowledged; None where there is none."""
+        """When the oldest byte was written that is not known to be acknowledged; None if there is none."""
 
     def __repr__(self) -> str:
         return f"<Backlog of {len(self._entries)} writes>"
 
     def written(self, size: int, now: float) -> None:
-        """Enter a write of ``size`` bytes."""
+        """Record a write of ``size`` bytes."""
         self._written += size
         if len(self._entries) >= ENTRIES:
             _, now = self._entries.pop()
@@ -37,7 +37,7 @@ class Backlog:
             self.since = now
 
     def waited_s(self, now: float) -> float:
-        """Return for how long the oldest write has waited; 0 only if there is none, though the clock may stand."""
+        """Return for how long the oldest write has waited; 0 only if there is none, even if the clock stands still."""
         return max(now - self.since, LEAST_S) if self.since is not None else 0.0
 
     def settle(self, outstanding: int) -> None:

@@ -14,14 +14,15 @@ from zbridge.transport.transferable import Parcel
 async def connect(
     address: DeviceAddress, receiver: Receiver, buffer: bytearray | None = None, kernel: Kernel = KERNEL
 ) -> Link:
-    """Connect ``receiver`` to the robot at ``address``; raise LinkError with the reason where that is not possible.
+    """Connect ``receiver`` to the robot at ``address``; raise LinkError with the reason if that fails.
 
-    buffer: where reads from sockets go, which links of one loop may share. kernel: of this machine, or a simulated one.
+    buffer: receives what is read from sockets; links of one loop may share it. kernel: of this machine, or a simulated
+    one.
     """
     if isinstance(address, SerialAddress):
         return serial.connect(address, receiver)
     if isinstance(address, ZenohAddress):
-        from zbridge.transport import samples  # loads what only such links need
+        from zbridge.transport import samples  # loads what only these links need
 
         return await samples.connect(address, receiver)
     return await tcp.connect(address, receiver, buffer, kernel)
@@ -32,7 +33,7 @@ async def attach(
 ) -> Link:
     """Attach ``receiver`` to the connection that another process handed over; raise ProtocolError, OSError.
 
-    Only when the other process has let go: reading begins at once.
+    Call it only after the other process has detached: reading begins at once.
     """
     if isinstance(address, SerialAddress):
         return serial.attach(address, parcel.take(state.get("serial")), receiver)

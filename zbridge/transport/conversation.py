@@ -1,12 +1,12 @@
 """Runs one session over one link: bytes in, frames out, timers. Knows neither protocol nor bus.
 
 A process that was frozen finds its timers overdue and the peer's bytes unread. The order then is: what must leave first
-(``before``), what waits to be read, and the session's timers :data:`CATCH_UP_S` later. So no session ends for a silence
-that was its own.
+(``before``), waiting input, and the session's timers :data:`CATCH_UP_S` later. So no session ends for a silence that
+the process itself caused.
 
-``pump`` is the one place that writes. Everything that may give the session something to write, or change its state,
-ends with it: bytes, a timer, a command of the device. What the protocol's own code raises in any of them ends its
-session, with the place as the reason.
+Only ``pump`` writes. Everything that may give the session something to write, or change its state, ends with it: bytes,
+a timer, a command of the device. An exception of the protocol's own code in any of them ends its session, with file and
+line as the reason.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from zbridge.protocol.kept import Budget, Exported
 from zbridge.protocol.session import Datagram, Session, State
 from zbridge.transport.fair_share import FairShare
 from zbridge.transport.link import Link
-from zbridge.transport.reading import Reading
+from zbridge.transport.reading import ReadControl
 from zbridge.transport.stalls import Stalls
 from zbridge.transport.transferable import Parcel
 
 log = logging.getLogger("zbridge.link")
 
 LATE_S = 0.02
-"""A timer of a session that fires so much late tells of a process, or a machine, that was held up; seconds."""
+"""A session's timer that fires this late shows that the process, or the machine, was held up; seconds."""
 CATCH_UP_S = 0.05
-"""Seconds for which such a process reads before the timers of the session run."""
+"""Seconds for which such a process reads before it runs the session's timers."""
 _ESTABLISHED = State.ESTABLISHED
 
 
@@ -41,7 +41,7 @@ _P = ParamSpec("_P")
 
 
 def _then_pump(step: Callable[Concatenate[Conversation, _P], None]) -> Callable[Concatenate[Conversation, _P], None]:
-    """Let a step end with ``pump``; a fault of the protocol's own code ends the session."""
+    """Make a step end with ``pump``; an exception of the protocol's own code ends the session."""
 
     @wraps(step)
     def contained(self: Conversation, /, *args: _P.args, **kwargs: _P.kwargs) -> None:
@@ -57,15 +57,15 @@ def _then_pump(step: Callable[Concatenate[Conversation, _P], None]) -> Callable[
 class Conversation:
     """The receiver of a link, and the driver of a session.
 
-    ``deliver`` takes the messages of each read. ``changed`` is called on every change of the session's state.
-    ``before`` is called before each write: what must leave first may be given to the session there.
+    ``deliver`` receives the messages of each read. ``changed`` is called on every change of the session's state.
+    ``before`` is called before each write, and may pass the session what must leave first.
     ``stalled(True)`` is called when bytes have waited for their acknowledgement for longer than STALLED_S. From then on
     nothing is written: a robot would read what piles up as one packet, and lose it. ``stalled(False)`` is called when
     all is acknowledged, before the next write.
-    ``refused`` is told which datagrams in the peer's name did not come from the peer.
-    ``may_warn(kind)`` says whether a warning of this kind may be logged now.
-    ``share``: of a processor; who sends more than can be worked off within it is not read meanwhile, and its datagrams
-    are dropped and counted by ``surplus``.
+    ``refused`` is called for datagrams in the peer's name that did not come from the peer.
+    ``may_warn(kind)`` returns whether a warning of this kind may be logged now.
+    ``share``: of a processor; a peer that sends more than can be processed within it is not read meanwhile, and its
+    datagrams are dropped and counted by ``surplus``.
     ``linked`` is called with the link and True when the link is up, and False when it is gone.
     ``read`` is called when the bytes of a read have been cut into frames.
     ``clock``: seconds on the loop's time line; the default is the loop's own clock, which may be a millisecond behind.
@@ -105,7 +105,7 @@ class Conversation:
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at: float | None = None
         self._reads_until = -math.inf
-        """The timers of the session do not run before: the process was held up, and reads first."""
+        """When the session's timers run again: the process was held up, and reads first."""
         self._seen = (session.state, session.busy, session.doubts)
         self._malformed = malformed or Count()
         self._foreign = foreign or Count()
@@ -115,9 +115,9 @@ class Conversation:
         self._malformed_logged = 0
         self._surplus = surplus or Count()
         self._stalls = Stalls(self._clock, stalled)
-        self._reading = Reading(loop, self._clock, share)
+        self._reading = ReadControl(loop, self._clock, share)
         self.connected_at: float | None = None
-        """When the link came up, also of the process that had it before; None before it was ever up."""
+        """When the link came up, also in the process that had it before; None if it was never up."""
         self._heard_at = -math.inf
 
     def __repr__(self) -> str:
@@ -165,7 +165,7 @@ class Conversation:
 
     @_then_pump
     def rivalled(self) -> None:
-        """Count a second source, or session, with the same claim, and tell the session."""
+        """Count a second source, or session, with the same claim, and notify the session."""
         self._rivals.value += 1
         self.session.rivalled(self._clock())
         if self._may_warn("with a rival source of datagrams"):
@@ -192,7 +192,7 @@ class Conversation:
             self._report_malformed()
 
     def _fault(self, error: Exception) -> None:
-        """End the session, and show where the code of its protocol is wrong."""
+        """End the session, and log where the code of its protocol is wrong."""
         log.error("%s: %s%s", self.session.name, FAULT, describe(error), exc_info=error)
         self.session.fail(f"{FAULT}{describe(error)}")
         self._end()
@@ -227,11 +227,11 @@ class Conversation:
             link.drop_source()
         established = session.state is _ESTABLISHED
         writing = link is not None and (
-            (not established and session.over) or self._stalls.takes(link)
-        )  # last words leave
+            (not established and session.over) or self._stalls.accepts(link)
+        )  # the last frames leave
         now = self._clock()
         while writing and link is not None and link.ready and (not established or outbox.due(now)):
-            self._before()  # what becomes due while the process is frozen waits for its turn: ``now`` is older
+            self._before()  # what becomes due while the process is frozen comes later: ``now`` is older
             frame = session.outgoing(now)
             if frame is None:
                 break
@@ -255,17 +255,17 @@ class Conversation:
 
     @property
     def stalled(self) -> bool:
-        """Whether the kernel has not taken all that was written."""
+        """Whether the kernel has not accepted all that was written."""
         return self._link is not None and not self._link.ready
 
     @property
     def unheard_s(self) -> float:
-        """Seconds since anything came by the link, or it came up."""
+        """Seconds since the link last received anything, or came up."""
         return self._clock() - self._heard_at
 
     @property
     def connected_s(self) -> float:
-        """Age of the connection in seconds; 0 where there is none."""
+        """Age of the connection in seconds; 0 if there is none."""
         return self._clock() - self.connected_at if self._link is not None and self.connected_at is not None else 0.0
 
     @property
@@ -311,11 +311,11 @@ class Conversation:
 
     @property
     def blocker(self) -> str | None:
-        """Why the conversation cannot be handed to another process now; None where it can."""
+        """Why the conversation cannot be handed to another process now; None if it can."""
         link = self._link
         if link is None or self.session.over:
             return "the connection is not up"
-        return link.blocker or (None if link.ready else "the peer takes nothing")
+        return link.blocker or (None if link.ready else "the peer is stalled")
 
     def suspend(self) -> None:
         """Read and write nothing, and run no timer, until :meth:`resume`."""
@@ -344,7 +344,7 @@ class Conversation:
         }
 
     def detach(self) -> None:
-        """Forget the connection, which another process has now: the peer notices nothing."""
+        """Detach the connection, which another process has now: the peer notices nothing."""
         self.suspended = True
         self._set_timer(None)
         self._reading.end()
@@ -362,7 +362,7 @@ class Conversation:
             self.session.expire(now)
 
     def _deadline(self, now: float, *, writing: bool) -> float | None:
-        """Give the time of the next tick; ``writing`` False: the link takes nothing now."""
+        """Return the time of the next tick; ``writing`` False: the link is stalled now."""
         if now >= self._reads_until:
             return self.session.deadline(writing=writing)
         writes_at = self.session.outbox.deadline() if writing else None

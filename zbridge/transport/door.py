@@ -1,7 +1,7 @@
 """The sockets of a listener: bound here, or taken over from another process. Knows no session.
 
-A door is open while peers are accepted. One that is shut keeps its sockets: the kernel lets those who come wait in its
-queue, for this process (:meth:`Door.open`) or for one that was handed the sockets.
+A door is open while it accepts peers. A shut door keeps its sockets: new peers wait in the kernel's queue for this
+process (:meth:`Door.open`), or for the one that is handed the sockets.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ L = TypeVar("L", bound=asyncio.BaseProtocol)
 
 
 class Door:
-    """The sockets of one listener. ``state``, ``parcel``: as another process exported them; it begins shut then."""
+    """The sockets of one listener. ``state``, ``parcel``: as another process exported them; such a door begins shut."""
 
     def __init__(self, state: Exported | None = None, parcel: Parcel | None = None, kernel: Kernel = KERNEL) -> None:
         self.kernel = kernel
@@ -65,7 +65,7 @@ class Door:
             self._hub.restore(self.kernel.adopt(self._parcel.take(state["udp"])))
 
     async def open(self) -> None:
-        """Accept peers, again or for the first time; take their datagrams."""
+        """Accept peers, for the first time or again; receive their datagrams."""
         loop = asyncio.get_running_loop()
         for bound in self._sockets if not self._servers else ():
             copy = self.kernel.adopt(self.kernel.duplicate(bound.fileno()))
@@ -75,13 +75,13 @@ class Door:
             self._hub.resume()
 
     def shut(self) -> None:
-        """Accept nobody until :meth:`open`. Who was accepted in this turn of the loop is attached in the next two."""
+        """Accept nobody until :meth:`open`. Peers accepted in this turn of the loop are attached in the next two."""
         servers, self._servers = self._servers, []
         for server in servers:
             server.close()
 
     def suspend(self) -> None:
-        """Take no datagrams until :meth:`open`."""
+        """Receive no datagrams until :meth:`open`."""
         if self._hub is not None:
             self._hub.suspend()
 
@@ -114,8 +114,8 @@ class Door:
 async def make_link(sock: socket.socket, make: Callable[[], L]) -> L:
     """Make a link of a connected socket, whose descriptor belongs to the link from now on; raise OSError.
 
-    Where the peer has already gone, uvloop closes the descriptor before it knows the socket object. That object must
-    not close it once more: by then the number may be that of another file of this process.
+    If the peer is already gone, uvloop closes the descriptor before it knows the socket object. That object must not
+    close it again: by then the number may belong to another file of this process.
     """
     transport, link = await asyncio.get_running_loop().create_connection(make, sock=sock)
     inner = transport.get_extra_info("socket")

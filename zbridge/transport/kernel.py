@@ -1,6 +1,6 @@
 """What links need of the operating system beside the event loop: sockets by number, their queues, and the time.
 
-A simulation puts its own in the place of :data:`KERNEL`. Knows no link.
+A simulation replaces :data:`KERNEL`. Knows no link.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Kernel(Protocol):
         """Bind a UDP socket that does not block; raise OSError."""
 
     def unacknowledged(self, sock: socket.socket) -> int:
-        """Count the bytes that the peer has not acknowledged; raise OSError where the platform does not tell."""
+        """Count the bytes that the peer has not acknowledged; raise OSError if the platform does not report it."""
 
 
 class _Kernel:

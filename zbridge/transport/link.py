@@ -17,7 +17,7 @@ STALLED_S = 0.3
 
 
 class Receiver(Protocol):
-    """Takes what a link reads. All methods run on the event loop's thread."""
+    """Receives what a link reads. All methods run on the event loop's thread."""
 
     def attached(self, link: Link) -> None:
         """Start: the connection is up. Called once, before every other method."""
@@ -29,13 +29,13 @@ class Receiver(Protocol):
         """Take a datagram from the peer."""
 
     def claims(self, datagram: bytes, port: int) -> bool:
-        """Tell whether a datagram from a port of the peer's host that is nobody's source yet is from the peer."""
+        """Return whether a datagram from a port of the peer's host that is nobody's source yet is from the peer."""
 
     def rivalled(self) -> None:
         """React to a second source, or a second receiver, with the same claim: the peer has no source any more."""
 
     def stray_datagram(self, datagram: bytes) -> None:
-        """ReadPayload at a datagram of the peer's host that nobody claimed; the link has dropped it."""
+        """Inspect a datagram of the peer's host that nobody claimed; the link has dropped it."""
 
     def foreign_datagram(self) -> None:
         """Count a datagram from elsewhere; the link has dropped it."""
@@ -52,22 +52,22 @@ class Link(Protocol):
 
     peer: str
     reads: Callable[[], object]
-    """Called before bytes are taken from the kernel; set by who watches the link. :meth:`Receiver.received` follows,
-    with b"" where there were none."""
+    """Called before bytes are read from the kernel; set by the owner of the link. :meth:`Receiver.received` follows,
+    with b"" if there were none."""
 
     @property
     def descriptors(self) -> tuple[int, ...]:
-        """File descriptors: of the stream, then of the datagrams where there are any. Empty while there is no link."""
+        """File descriptors: of the stream, then of the datagrams if there are any. Empty while there is no link."""
 
     @property
     def ready(self) -> bool:
-        """Whether the link takes a write now; if not, :meth:`Receiver.writable` is called when it does."""
+        """Whether the link accepts a write now; if not, :meth:`Receiver.writable` is called when it does."""
 
     def write(self, data: bytes) -> None:
         """Write ``data`` as one segment."""
 
     def write_datagram(self, data: bytes) -> None:
-        """Send ``data`` as one datagram to the peer. It is lost if the network does not take it now."""
+        """Send ``data`` as one datagram to the peer. It is lost if the network does not accept it now."""
 
     def drop_source(self) -> None:
         """Forget which source an accepted peer's datagrams come from; idempotent."""
@@ -80,8 +80,8 @@ class Link(Protocol):
     def unacknowledged_s(self) -> float:
         """Seconds for which the oldest written byte has waited for its acknowledgement.
 
-        Exact above :data:`STALLED_S`; below, the byte may be acknowledged already. 0 only where nothing waits, or where
-        the platform does not tell.
+        Exact above :data:`STALLED_S`; below, the byte may be acknowledged already. 0 only if nothing waits, or if the
+        platform does not report it.
         """
 
     def pause_reading(self) -> None:
@@ -92,7 +92,7 @@ class Link(Protocol):
 
     @property
     def blocker(self) -> str | None:
-        """Why this connection cannot be handed to another process; None where it can."""
+        """Why this connection cannot be handed to another process; None if it can."""
 
     def suspend(self) -> None:
         """Read nothing, neither stream nor datagrams, until :meth:`resume`: another process may do so meanwhile."""
@@ -101,10 +101,10 @@ class Link(Protocol):
         """Read again, after :meth:`suspend`."""
 
     def export(self, parcel: Parcel) -> Exported:
-        """Put what the connection consists of into a parcel; describe it. The link must be suspended and ``ready``."""
+        """Put the connection's descriptors into a parcel; describe them. The link must be suspended and ``ready``."""
 
     def detach(self) -> None:
-        """Give up a connection that another process has now: neither the peer nor the receiver notices."""
+        """Detach a connection that another process has now: neither the peer nor the receiver notices."""
 
     def close(self) -> None:
         """Close the connection after what was written; idempotent."""
@@ -117,7 +117,7 @@ class Link(Protocol):
 
 
 class _Nobody:
-    """Takes nothing: the receiver of a link that was given up."""
+    """Ignores everything: the receiver of a link that was detached."""
 
     def attached(self, link: Link) -> None: ...
     def received(self, data: bytes) -> None: ...

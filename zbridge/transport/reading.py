@@ -9,10 +9,10 @@ from zbridge.transport.fair_share import FairShare
 from zbridge.transport.link import Link
 
 
-class Reading:
+class ReadControl:
     """Pauses and resumes the reading of one link.
 
-    ``share``: of a processor; None: as much as there is. ``clock``: seconds on the loop's time line.
+    ``share``: of a processor; None: unlimited. ``clock``: seconds on the loop's time line.
     """
 
     def __init__(
@@ -20,7 +20,7 @@ class Reading:
     ) -> None:
         self.link: Link | None = None
         self.suspended = False
-        """Whether another process has the connection, or may get it: then it is not read, whatever else is said."""
+        """Whether another process has the connection, or may get it: then it is not read in any case."""
         self._loop = loop
         self._clock = clock
         self._share = share
@@ -28,7 +28,7 @@ class Reading:
         self._rests: asyncio.TimerHandle | None = None
 
     def __repr__(self) -> str:
-        return f"<Reading {'paused' if self._paused else 'rests' if self.rests else 'on'}>"
+        return f"<ReadControl {'paused' if self._paused else 'rests' if self.rests else 'on'}>"
 
     @property
     def rests(self) -> bool:
@@ -47,7 +47,7 @@ class Reading:
         self._resume()
 
     def worked(self, begun: float) -> None:
-        """Note work for the link that began at ``begun`` and ends now; rest where it was more than the share."""
+        """Record work for the link that began at ``begun`` and ends now; pause if it exceeded the share."""
         if self._share is None:
             return
         now = self._clock()

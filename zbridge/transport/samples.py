@@ -4,8 +4,8 @@ The session is never the fleet's: it is a client of the robots' router, or is th
 simulated robots). Knows no robot and no format of keys, payloads and attachments.
 
 What comes is bounded before it is copied: :data:`RATE_HZ` samples a second of each subscription, then the bounds of the
-bus's inbox. What is left out is counted, and told to the receiver. A router tells nothing of what it has passed on: the
-link knows no stall, and its receiver has to watch for silence.
+bus's inbox. What is dropped is counted, and reported to the receiver. A router does not report what it has forwarded:
+the link detects no stall, and its receiver has to watch for silence.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from zbridge.transport.transferable import Parcel
 RATE_HZ = 2000.0
 """Samples a second of one subscription; more are dropped on Zenoh's own thread."""
 DECLARED = 256
-"""Keys that a link may have declared at a time."""
-LOOK_S = 0.5
+"""Most keys that a link may have declared at a time."""
+REPORT_S = 0.5
 """Seconds between two reports: the time, and what was dropped."""
 
 
 class ZenohLink:
-    """One Zenoh session. Made by :func:`connect` and :func:`serve`; its receiver is told when the session ends."""
+    """One Zenoh session. Made by :func:`connect` and :func:`serve`; its receiver is notified when the session ends."""
 
     def __init__(self, peer: str, bus: Bus, metrics: Metrics, receiver: Receiver) -> None:
         self.peer = peer
@@ -48,7 +48,7 @@ class ZenohLink:
         self._publishers: dict[str, Publisher] = {}
         self._above = 0
         """Samples that came too fast."""
-        self._told = 0
+        self._reported = 0
         self._looking: dict[str, asyncio.Task[None]] = {}
         self._closing: asyncio.Task[bool] | None = None
         self._timer: asyncio.TimerHandle | None = None
@@ -72,7 +72,7 @@ class ZenohLink:
     unacknowledged_s = 0.0
 
     def write(self, data: bytes) -> None:
-        """Carry out one frame. Raises ProtocolError for one that cannot be, LinkError above :data:`DECLARED` keys."""
+        """Carry out one frame. Raises ProtocolError for one that is invalid, LinkError above :data:`DECLARED` keys."""
         if not self._open:
             return
         sample = read_sample(data)
@@ -96,7 +96,7 @@ class ZenohLink:
         """Do nothing: there is no source of datagrams."""
 
     def pause_reading(self) -> None:
-        """Drop and count what comes, until :meth:`resume_reading`: Zenoh cannot be told to wait."""
+        """Drop and count what comes, until :meth:`resume_reading`: Zenoh cannot be asked to wait."""
         self._paused = True
 
     def resume_reading(self) -> None:
@@ -207,10 +207,10 @@ class ZenohLink:
         """Tell the time, and what was dropped since."""
         if not self._open:
             return
-        self._timer = self._loop.call_later(LOOK_S, self._report)
+        self._timer = self._loop.call_later(REPORT_S, self._report)
         lost = self._above + self._metrics.total("bus_in_dropped")
-        if lost > self._told:
-            count, self._told = lost - self._told, lost
+        if lost > self._reported:
+            count, self._reported = lost - self._reported, lost
             self._feed(dropped(count))
         self._feed(KeyedSample(SampleKind.OPENED, payload=self._bus.zid.encode(), stamp_ns=time.time_ns()))
 
@@ -241,7 +241,7 @@ _closing: set[asyncio.Task[bool]] = set()
 
 
 async def connect(address: ZenohAddress, receiver: Receiver) -> ZenohLink:
-    """Open a session that is a client of the router at ``address``; raise LinkError where there is none."""
+    """Open a session that is a client of the router at ``address``; raise LinkError if there is none."""
     settings = BusSettings(mode="client", connect=(address.endpoint,), multicast=False)
     link = await _opened(str(address), settings, receiver)
     link.begin(ends=True)
@@ -250,7 +250,7 @@ async def connect(address: ZenohAddress, receiver: Receiver) -> ZenohLink:
 
 @contextlib.asynccontextmanager
 async def serve(address: Address, receiver: Receiver) -> AsyncIterator[ZenohLink]:
-    """Open a router at ``address``, which is itself the session of ``receiver``; raise LinkError where it cannot be."""
+    """Open a router at ``address``, which is itself the session of ``receiver``; raise LinkError if it cannot be."""
     settings = BusSettings(mode="router", listen=(f"tcp/{address.host}:{address.port}",), multicast=False)
     link = await _opened(str(address), settings, receiver)
     link.begin(ends=False)

@@ -27,14 +27,14 @@ from zbridge.transport.transferable import Parcel
 READ_BYTES = 4096
 """Most bytes taken from a line before the loop serves others; the kernel's buffer of a terminal holds no more."""
 CLOSE_S = 1.0
-"""Seconds a line is given to carry what was written before it was closed."""
-LOOK_S = 0.01
-"""Seconds between two looks at a closing line whose last bytes are not sent yet."""
+"""Seconds for a closing line to send what was written before."""
+POLL_S = 0.01
+"""Seconds between two polls of a closing line whose last bytes are not sent yet."""
 _INT = struct.Struct("=i")
 
 
 class SerialLink:
-    """A serial line. Made by :func:`connect`; a line that fails is closed and its receiver told so.
+    """A serial line. Made by :func:`connect`; a line that fails is closed and its receiver notified.
 
     What the driver does not take at once waits here, and ``ready`` is False meanwhile: one write at most, as long as
     the caller writes only while ``ready`` is True. A write counts as acknowledged when its bytes have left the
@@ -191,11 +191,11 @@ class SerialLink:
                 self._receiver.writable()
 
     def _close_when_sent(self) -> None:
-        """ReadPayload until the output queue is empty, or time is up: the kernel itself would block in ``close``."""
+        """Poll until the output queue is empty, or time is up: the kernel itself would block in ``close``."""
         if not self._open or self._close_by is None:
             return
         if self._unsent() and self._loop.time() < self._close_by:
-            self._loop.call_later(LOOK_S, self._close_when_sent)
+            self._loop.call_later(POLL_S, self._close_when_sent)
         else:
             self._end("closed")
 
@@ -264,7 +264,7 @@ def _opened(address: SerialAddress) -> Any:
 
 
 def _explained(error: Exception) -> str:
-    """Tell why a line could not be opened; pyserial's errors repeat the path and hide the number."""
+    """Return why a line could not be opened; pyserial's errors repeat the path and hide the number."""
     number = getattr(error, "errno", None)
     if number in (errno.EAGAIN, errno.EBUSY):
         return "another program uses this line"

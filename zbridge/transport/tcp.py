@@ -29,13 +29,13 @@ from zbridge.transport.udp import DatagramHub, DatagramSocket
 log = logging.getLogger("zbridge.link")
 
 READ_BYTES = 64 * 1024
-"""Most bytes taken from a robot's socket before the loop serves others."""
+"""Most bytes read from a robot's socket before the loop serves others."""
 SHARED_READ_BYTES = 4 * 1024
-"""The same where the loop serves other robots too."""
+"""The same if the loop serves other robots too."""
 CLIENT_READ_BYTES = 4096
 """The same for an accepted peer: there may be hundreds."""
 CLIENT_WRITE_BYTES = 64 * 1024
-"""Bytes that the kernel keeps for an accepted peer that reads slowly; older ones are of no use."""
+"""Bytes that the kernel buffers for an accepted peer that reads slowly; older ones are useless."""
 GIVE_UP_S = 60.0
 """Seconds without acknowledgement after which a robot's connection ends: long, for a legacy robot gives only one."""
 CLIENT_GIVE_UP_S = 10.0
@@ -43,7 +43,7 @@ CLIENT_GIVE_UP_S = 10.0
 _TCP_INFO = struct.Struct("=24xI28xI")
 """Two fields of Linux's tcp_info: unacknowledged segments, and milliseconds since the last acknowledgement."""
 CLOSE_S = 1.0
-"""Seconds that a closing connection waits for its last bytes to be taken."""
+"""Seconds that a closing connection waits until its last bytes are accepted."""
 CONNECT_S = 5.0
 """Seconds that a connection attempt may take."""
 
@@ -55,9 +55,9 @@ def _unwatched() -> None:
 class TcpLink(asyncio.BufferedProtocol):
     """A TCP connection. ``hub``: the listener's UDP socket, if the peer was accepted there.
 
-    ``buffer``: where reads go, :data:`READ_BYTES` of its own by default. Reads are copied at once, so all links of a
-    loop may share it. ``accepted``: by a listener. ``restored_udp``: the socket for datagrams to a robot, where another
-    process handed the connection over.
+    ``buffer``: receives what is read; :data:`READ_BYTES` of its own by default. Reads are copied at once, so all links
+    of a loop may share it. ``accepted``: by a listener. ``restored_udp``: the socket for datagrams to a robot, if
+    another process handed the connection over.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class TcpLink(asyncio.BufferedProtocol):
 
     @property
     def descriptors(self) -> tuple[int, ...]:
-        """File descriptors of the stream, and of our own socket for datagrams where there is one."""
+        """File descriptors of the stream, and of our own socket for datagrams if there is one."""
         if self._transport is None:
             return ()
         stream: int = self._transport.get_extra_info("socket").fileno()
@@ -97,7 +97,7 @@ class TcpLink(asyncio.BufferedProtocol):
 
     @property
     def ready(self) -> bool:
-        """Whether the kernel took all that was written."""
+        """Whether the kernel accepted all that was written."""
         return self._transport is not None and not self._writing_paused
 
     def write(self, data: bytes) -> None:
@@ -108,10 +108,10 @@ class TcpLink(asyncio.BufferedProtocol):
             self._transport.write(data)
 
     def write_datagram(self, data: bytes) -> None:
-        """Send ``data`` as one datagram to the peer. It is lost if the network does not take it now.
+        """Send ``data`` as one datagram to the peer. It is lost if the network does not accept it now.
 
-        To a robot, the first datagram opens a socket that hears the robot's address and port only. An accepted peer
-        gets datagrams from the listener's port.
+        To a robot, the first datagram opens a socket that receives from the robot's address and port only. An accepted
+        peer gets datagrams from the listener's port.
         """
         if self._hub is not None:
             self._hub.send(self, data)
@@ -182,13 +182,13 @@ class TcpLink(asyncio.BufferedProtocol):
             self._datagrams.resume()
 
     def export(self, parcel: Parcel) -> Exported:
-        """Put the sockets into a parcel. What the kernel has is sent by the kernel."""
+        """Put the sockets into a parcel. The kernel sends what it has buffered."""
         assert self._transport is not None
         udp = parcel.put(self._datagrams.fileno()) if self._datagrams is not None else None
         return {"tcp": parcel.put(self._transport.get_extra_info("socket").fileno()), "udp": udp}
 
     def detach(self) -> None:
-        """Give up the own descriptors of a connection that another process has now: no FIN is sent."""
+        """Close our descriptors of a connection that another process has now: no FIN is sent."""
         self._receiver = NOBODY
         self.abort()
 
@@ -240,10 +240,10 @@ class TcpLink(asyncio.BufferedProtocol):
     def buffer_updated(self, nbytes: int) -> None:
         data = bytes(self._view[:nbytes])
         if self._hub is not None:
-            self._hub.drain()  # datagrams that wait are older: an old drive must not follow a newer stop
+            self._hub.drain()  # waiting datagrams are older: an old drive must not follow a newer stop
         self._receiver.received(data)
         if nbytes == len(self._view) and self.reads is not _unwatched:
-            # libuv reads once more, often in vain: who watches the reads must learn that nothing was taken.
+            # libuv reads once more, often in vain: report to the watcher of reads that nothing was read.
             asyncio.get_running_loop().call_soon(self._read_in_vain)
 
     def _read_in_vain(self) -> None:
@@ -271,9 +271,9 @@ class TcpLink(asyncio.BufferedProtocol):
 async def connect(
     address: Address, receiver: Receiver, buffer: bytearray | None = None, kernel: Kernel = KERNEL
 ) -> TcpLink:
-    """Connect within :data:`CONNECT_S`, or raise LinkError with the reason. buffer: where reads go; links may share it.
+    """Connect within :data:`CONNECT_S`, or raise LinkError with the reason.
 
-    Reads are as large as the buffer at most.
+    buffer: receives what is read, at most its size at a time; links may share it.
     """
     loop = asyncio.get_running_loop()
     try:
@@ -306,11 +306,11 @@ async def listen(
     secured: Callable[[Receiver], Receiver] | None = None,
     door: Door | None = None,
 ) -> AsyncIterator[Address]:
-    """Accept peers, each with a receiver of its own; give the address that is bound, with its port.
+    """Accept peers, each with a receiver of its own; return the bound address with its port.
 
-    ``datagrams``: serve UDP on the same port number too; ``foreign`` counts the datagrams of nobody. ``secured`` puts a
-    filter before each receiver (TLS); then there are no datagrams. ``door``: keeps the sockets, for who shuts it or
-    hands them over. Raise LinkError if the address cannot be bound.
+    ``datagrams``: serve UDP on the same port number too; ``foreign`` counts datagrams that belong to no client.
+    ``secured`` puts a filter before each receiver (TLS); then there are no datagrams. ``door``: keeps the sockets, to
+    be shut or handed over. Raise LinkError if the address cannot be bound.
     """
     door = door or Door()
     kernel = door.kernel

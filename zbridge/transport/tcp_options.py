@@ -1,4 +1,4 @@
-"""The options of TCP sockets, and what the kernel tells of them. Knows no link."""
+"""The options of TCP sockets, and what the kernel reports about them. Knows no link."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from zbridge.transport.kernel import Kernel
 log = logging.getLogger("zbridge.link")
 
 KEEPALIVE_S = 1
-"""Seconds of silence after which the kernel asks an accepted peer for a sign of life."""
+"""Seconds of silence after which the kernel sends keep-alives to an accepted peer."""
 _RETRY_MOST_S = 1.0
 """Longest time between two retransmissions of the kernel to a robot."""
 _TCP_RTO_MAX_MS = 44
@@ -21,7 +21,7 @@ _TCP_RTO_MAX_MS = 44
 
 
 def tune(sock: socket.socket, give_up_s: float) -> None:
-    """Send each write at once; give a connection up that acknowledges nothing for ``give_up_s`` seconds."""
+    """Send each write at once; end a connection that acknowledges nothing for ``give_up_s`` seconds."""
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for option, value in (
@@ -35,7 +35,7 @@ def tune(sock: socket.socket, give_up_s: float) -> None:
 
 
 def keep_alive(sock: socket.socket) -> None:
-    """Ask a silent peer for a sign of life every second; ``tune`` says when the connection ends."""
+    """Send a silent peer a keep-alive every second; ``tune`` sets when the connection ends."""
     for option, value in (("TCP_KEEPIDLE", KEEPALIVE_S), ("TCP_KEEPINTVL", KEEPALIVE_S), ("TCP_KEEPCNT", 10)):
         if hasattr(socket, option):
             sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
@@ -51,14 +51,14 @@ _unwatched_warned = False
 
 
 def new_backlog(sock: socket.socket, kernel: Kernel) -> Backlog | None:
-    """Make a backlog if the platform tells what is unacknowledged; else warn once and return None."""
+    """Make a backlog if the platform reports what is unacknowledged; else warn once and return None."""
     global _unwatched_warned  # noqa: PLW0603
     try:
         kernel.unacknowledged(sock)
     except OSError:
         if not _unwatched_warned:
             _unwatched_warned = True
-            log.warning("this platform does not tell what robots acknowledged: drives are written to broken links too")
+            log.warning("this platform does not report unacknowledged bytes: drives are also written to broken links")
         return None
     backlog = Backlog()
     if unsent := kernel.unacknowledged(sock):  # of the process that had the connection before

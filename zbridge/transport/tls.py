@@ -1,9 +1,9 @@
 """TLS at a listener: a filter between an accepted TCP link and its receiver. Knows no socket, frame or session.
 
-The receiver is attached before the handshake: who may not connect costs none, and one that never ends its handshake
-counts as a client. The link takes writes from the end of the handshake on (``ready``). All that TCP tells (what the
-kernel took, how long the peer has been silent) is told as without TLS, for what waits is in the TCP link only. There
-are no datagrams.
+The receiver is attached before the handshake: a peer that may not connect costs no handshake, and one that never
+completes it counts as a client. The link accepts writes once the handshake is complete (``ready``). All that TCP
+reports (what the kernel accepted, how long the peer has been silent) is reported as without TLS, because only the TCP
+link buffers. There are no datagrams.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from zbridge.transport.link import Link, Receiver
 from zbridge.transport.transferable import Parcel
 
 _READ_BYTES = 16_384
-"""The most that one record of TLS holds."""
+"""Most bytes of one TLS record."""
 
 
 def server_context(certificate: str, key: str, ca: str | None = None) -> ssl.SSLContext:
-    """Return what a listener shows its peers; raise LinkError, which says what cannot be used.
+    """Return the TLS context of a listener; raise LinkError, which names what cannot be used.
 
-    ca: peers must show a certificate of this authority; None: they show none.
+    ca: peers must present a certificate of this authority; None: they present none.
     """
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
@@ -59,7 +59,7 @@ class TlsLink(Receiver):
         self._link: Link | None = None
         self._open = False
         self._why: str | None = None
-        """Why we ended it."""
+        """Why we ended the connection."""
         self._timer: asyncio.TimerHandle | None = None
 
     def __repr__(self) -> str:
@@ -69,7 +69,7 @@ class TlsLink(Receiver):
 
     @property
     def ready(self) -> bool:
-        """Whether the handshake is done, and the kernel took all that was written."""
+        """Whether the handshake is complete, and the kernel accepted all that was written."""
         return self._open and self._link is not None and self._link.ready
 
     @property
@@ -89,7 +89,7 @@ class TlsLink(Receiver):
             self._flush()
 
     def write_datagram(self, data: bytes) -> None:
-        """Lose the datagram: it would go in the open."""
+        """Drop the datagram: it would be sent unencrypted."""
 
     def drop_source(self) -> None:
         """Do nothing: there are no datagrams."""
@@ -216,7 +216,7 @@ class TlsLink(Receiver):
             self._link.write(self._outgoing.read())
 
     def _say_goodbye(self, link: Link) -> None:
-        with contextlib.suppress(ssl.SSLError):  # the peer's own goodbye is not waited for
+        with contextlib.suppress(ssl.SSLError):  # do not wait for the peer's close notification
             self._tls.unwrap()
         if self._outgoing.pending:
             link.write(self._outgoing.read())

@@ -1,4 +1,4 @@
-"""What a restart hands to another process: the steps of a handover, and the descriptors on their way."""
+"""What a restart hands to another process: the steps of a handover, and the descriptors in transit."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ from zbridge.transport.kernel import KERNEL, Kernel
 
 
 class Transferable:
-    """A part of a gateway that a successor gets: the device, a listener, the claim on the robot.
+    """A part of a gateway that is handed to a successor: the device, a listener, the claim on the robot.
 
-    Theory of operation. The gateway that goes takes each step with all its parts before it takes the next one:
+    Theory of operation. The predecessor takes each step with all its parts before it takes the next one:
 
     1. ``prepare``: stop what moves, and wait until the part can be handed over.
-    2. ``shut``: accept nobody any more.
-    3. ``suspend``: read and write nothing, and run no timer. What comes waits in the kernel.
-    4. ``export``: describe the part, a value of that moment; its descriptors go into the parcel.
+    2. ``shut``: stop accepting peers.
+    3. ``suspend``: read and write nothing, and run no timer. Input waits in the kernel.
+    4. ``export``: describe the part as it is now; its descriptors go into the parcel.
     5. ``withdraw``, when the successor has restored and declared everything: leave the bus to it.
-    6. ``detach``, when the successor has the robot: close the own copies of the descriptors. No peer notices.
+    6. ``detach``, when the successor has the robot: close this process's copies of the descriptors. No peer notices.
 
     If anything fails before the sixth step, ``resume`` takes everything back, once the successor has ended.
 
     The successor makes the same parts from the same settings, and takes two steps with each:
 
-    1. ``restore``: be what was exported. Nothing is read or written yet.
-    2. ``resume``, when the other gateway has let go: attach the descriptors, read and write.
+    1. ``restore``: take the exported state. Nothing is read or written yet.
+    2. ``resume``, when the predecessor has detached: attach the descriptors, read and write.
 
-    A part overrides the steps that concern it. What a part consists of (connection, conversation, link, client, door)
-    has the same names for its share of a step; most of those do not wait.
+    A part overrides the steps that it needs. Its components (connection, conversation, link, client, door) use the same
+    names for their share of a step; most of those do not wait.
     """
 
     async def prepare(self, reason: str, within_s: float) -> None:
@@ -49,19 +49,20 @@ class Transferable:
         """Take no commands from the bus, and claim nothing on it, until :meth:`resume`; wait until it knows."""
 
     async def detach(self) -> None:
-        """Give up what the successor has now."""
+        """Close what the successor has now."""
 
     async def restore(self, state: Exported, parcel: Parcel) -> None:
-        """Be what another process exported; raise ProtocolError. Call once, on a part that was just made."""
+        """Take the state that another process exported; raise ProtocolError. Call once, on a newly made part."""
 
     async def resume(self) -> None:
-        """Take the steps since ``prepare`` back, or begin with what was restored."""
+        """Undo the steps since ``prepare``, or begin with the restored state."""
 
 
 class Parcel:
-    """Descriptors in the order of their numbers; ``descriptors`` of another process where they came from one.
+    """Descriptors in the order of their numbers; ``descriptors``: received from another process, if any.
 
-    Those that were put are duplicates: the own sockets stay as they are. Close the parcel when it was sent, or taken.
+    Descriptors that are put are duplicated: the sockets stay as they are. Close the parcel once it is sent, or
+    unpacked.
     """
 
     def __init__(self, descriptors: list[int] | None = None, kernel: Kernel = KERNEL) -> None:
@@ -81,7 +82,7 @@ class Parcel:
         return len(self.descriptors) - 1
 
     def take(self, number: object) -> int:
-        """Take a descriptor out, once; raise ProtocolError where there is none of this number."""
+        """Take a descriptor out, once; raise ProtocolError if there is none of this number."""
         if not isinstance(number, int) or not 0 <= number < len(self.descriptors) or number in self._taken:
             raise ProtocolError(f"no descriptor {number!r} among {len(self.descriptors)}")
         self._taken.add(number)

@@ -1,4 +1,4 @@
-"""Datagrams beside a TCP link: our own socket towards one peer, and the shared socket of a listener.
+"""Datagrams beside a TCP link: our own socket to one peer, and the shared socket of a listener.
 
 Knows no frame, session or protocol.
 """
@@ -16,15 +16,15 @@ from zbridge.transport.link import Link, Receiver
 
 _DATAGRAM_BYTES = 65_536
 _DATAGRAMS = 64
-"""Most datagrams taken from a socket before the loop serves others."""
+"""Most datagrams read from a socket before the loop serves others."""
 STRAYS_HZ = 20.0
-"""Unclaimed datagrams a second of one host that its links are shown; the others are only counted."""
+"""Unclaimed datagrams a second of one host that its links may inspect; the others are only counted."""
 STRAY_S = 0.02
 """Seconds for which a source is ignored after an unclaimed datagram: a flood must cost little."""
 STRAY_SOURCES = 1024
-"""Ignored sources that are kept; one more clears them all."""
+"""Most ignored sources; one more clears them all."""
 _DRAINED = 1024
-"""Most datagrams taken before a stream is read; a socket's default buffer holds fewer."""
+"""Most datagrams read before a stream is read; a socket's default buffer holds fewer."""
 
 
 class _DatagramReader:
@@ -51,7 +51,7 @@ class _DatagramReader:
         self._socket, self._suspended = sock, True
 
     def suspend(self) -> None:
-        """Read nothing until :meth:`resume`: what comes waits in the kernel."""
+        """Read nothing until :meth:`resume`: input waits in the kernel."""
         self._suspended = True
         if self._socket is not None:
             self._loop.remove_reader(self._socket.fileno())
@@ -93,7 +93,7 @@ class _DatagramReader:
 
 
 class DatagramSocket(_DatagramReader):
-    """A UDP socket to one robot: hears the address and port of the robot, and counts everything else."""
+    """A UDP socket to one robot: receives from the robot's address and port, and counts everything else."""
 
     def __init__(
         self,
@@ -125,9 +125,9 @@ class DatagramSocket(_DatagramReader):
 class DatagramHub(_DatagramReader):
     """The UDP socket of a listener: each source (address and port) belongs to the link of its host that claimed it.
 
-    Every link of the host is asked for a datagram of a source that is nobody's. If exactly one claims it and has no
-    source yet, the source is that link's. If several claim it, or one that has a source, somebody speaks in another's
-    name: all of them lose their sources and are told so (``rivalled``).
+    Every link of the host is asked for a datagram of an unclaimed source. If exactly one claims it and has no source
+    yet, that link gets the source. If several claim it, or one that has a source, somebody sends in another's name: all
+    of them lose their sources and are notified (``rivalled``).
     """
 
     def __init__(self, foreign: Count, kernel: Kernel = KERNEL) -> None:
@@ -144,7 +144,7 @@ class DatagramHub(_DatagramReader):
         self._listen(host, port)
 
     def add(self, link: Link, host: str, receiver: Receiver) -> None:
-        """Ask this link for the datagrams of its host from now on."""
+        """Offer this link the unclaimed datagrams of its host from now on."""
         self._hosts.setdefault(host, {})[link] = receiver
         self._strays.setdefault(host, RateLimit(STRAYS_HZ))
 
@@ -167,7 +167,7 @@ class DatagramHub(_DatagramReader):
         return self._sources.get(link)
 
     def bind(self, link: Link, receiver: Receiver, source: tuple[str, int]) -> None:
-        """Let a source be the link's, as it was in another process."""
+        """Assign a source to the link, as it was in another process."""
         self._sources[link] = source
         self._owners[source] = (link, receiver)
 

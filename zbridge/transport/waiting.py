@@ -1,4 +1,4 @@
-"""Sockets that listen for clients that are accepted one by one: who is not yet accepted waits in the kernel's queue."""
+"""Listening sockets whose clients are accepted one by one; the others wait in the kernel's queue."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import socket
 from zbridge.protocol.address import Address
 
 WAITING = 16
-"""Clients that wait in the operating system's queue; further ones are refused."""
+"""Most clients that wait in the kernel's queue; further ones are refused."""
 
 
 async def waiting_sockets(address: Address) -> list[socket.socket]:

@@ -118,7 +118,7 @@ class Field(msgspec.Struct, frozen=True):
 
 
 def declared_fields(message: type[Message]) -> list[Field]:
-    """Return the fields of a declaration; raise TypeError where one has no wire type."""
+    """Return the fields of a declaration; raise TypeError if one has no wire type."""
     hints = get_type_hints(message, include_extras=True)
     return [_field(field.name, hints[field.name]) for field in msgspec.structs.fields(message)]
 

@@ -57,7 +57,7 @@ class FrameBuffer:
     def partial(self, most_bytes: int | None = None) -> Partial | None:
         """Describe the incomplete frame for :meth:`resume`.
 
-        A frame of which more than ``most_bytes`` came is described by the bytes that are still to come; None where its
+        A frame of which more than ``most_bytes`` came is described by the bytes that are still to come; None if its
         first bytes do not tell how many.
         """
         rest = self._rest

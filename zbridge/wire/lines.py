@@ -42,7 +42,7 @@ class Lines(Generic[L]):
         return found + 1 if found >= 0 else len(data) + 1
 
     def read(self, frame: bytes) -> L:
-        """Read one line; raise ProtocolError where it is none of the messages or a number is out of range."""
+        """Read one line; raise ProtocolError if it is none of the messages or a number is out of range."""
         word, *numbers = frame.rstrip(b"\r\n").split(self._separator)
         codec = self._codecs.get(word)
         if codec is None:
@@ -52,6 +52,6 @@ class Lines(Generic[L]):
         return codec.decode(b"|".join(numbers))
 
     def write(self, message: L) -> bytes:
-        """Write one line; raise EncodeError where a number is out of range."""
+        """Write one line; raise EncodeError if a number is out of range."""
         numbers = self._codecs[message.word].encode(message)
         return message.word + (self._separator + numbers.replace(b"|", self._separator) if numbers else b"") + b"\n"

@@ -209,7 +209,7 @@ class FragileAlfHq(HqProgram):
         return None
 
     def _served(self) -> tuple[int, ...]:
-        """Give the ids that may come now: with ``auto`` 1 and 2 until the first command, from then on 4."""
+        """Return the ids that may come now: with ``auto`` 1 and 2 until the first command, from then on 4."""
         if self._serves != "auto":
             return _SERVED[self._serves]
         since_s = time.monotonic() - self._drove_at

@@ -58,12 +58,12 @@ class JudgedVehicle:
         self.place.step(self._speed_m_s, 0.0, self._turn_rad_s, dt)
 
     def geometry(self) -> list[int | float]:
-        """Give the fields of message 2: degrees, ms, mm ("Dialect `text`" 2)."""
+        """Return the fields of message 2: degrees, ms, mm ("Dialect `text`" 2)."""
         angle_max = _ANGLE_MIN_DEG + self._valid[1] * _STEP_DEG
         return [_ANGLE_MIN_DEG, angle_max, _STEP_DEG, 100, *_RANGES_MM]
 
     def measure(self) -> list[int]:
-        """Give the points in mm and both valid indices: outside of them anything, inside also 0 and codes below 20."""
+        """Return the points in mm and both valid indices: outside them anything, inside also 0 and codes below 20."""
         angles = self.place.heading + np.radians(_ANGLE_MIN_DEG + np.arange(self.points) * _STEP_DEG)
         ranges_mm = np.rint(1000 * cast(self.place.x, self.place.y, angles, _RANGES_MM[1] / 1000)).astype(np.int64)
         ranges_mm[ranges_mm >= _RANGES_MM[1]] = 0
@@ -77,7 +77,7 @@ class JudgedVehicle:
         return [*points, first, last]
 
     def feel(self, dialect: Dialect) -> list[int | float]:
-        """Give the fields of message 4 ("Translation": lateral to the right, vertical towards the ground)."""
+        """Return the fields of message 4 ("Translation": lateral to the right, vertical towards the ground)."""
         lateral_m_s2 = -self._speed_m_s * self._turn_rad_s
         accelerations_g = [self._gain_m_s2 / _GRAVITY_M_S2, lateral_m_s2 / _GRAVITY_M_S2, 1.0]
         gyro_deg_s = [0.0, 0.0, math.degrees(self._turn_rad_s)]

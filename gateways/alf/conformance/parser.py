@@ -95,7 +95,7 @@ class ParsedAlfMessage(msgspec.Struct, frozen=True):
 
 
 def deadly(number: str) -> str:
-    """Tell why std::stoi throws at a number, empty if it does not ("The gateway as vehicle")."""
+    """Return why std::stoi throws at a number, empty if it does not ("The gateway as vehicle")."""
     whole = number.split(".", maxsplit=1)[0]
     if whole in ("", "-"):
         return f"a number without leading digit, {number[:20]}"
@@ -140,7 +140,7 @@ class _AlfReader(MessageReader[ParsedAlfMessage]):
         return messages
 
     def whole(self, message: ParsedAlfMessage) -> bool:
-        """Tell whether a message has as many fields as its id has, valid or not."""
+        """Return whether a message has as many fields as its id has, valid or not."""
         return len(message.fields) == self._counts.get(message.kind)
 
     def _lost(self, data: bytes) -> str:
@@ -177,11 +177,11 @@ class _AlfReader(MessageReader[ParsedAlfMessage]):
         return ParsedAlfMessage(kind, fields, raw, problem, deadly=bool(breaks))
 
     def _breaks(self, kind: int, fields: Fields) -> str:
-        """Tell what the reader breaks on, empty if on nothing."""
+        """Return what the reader breaks on, empty if on nothing."""
         return ""
 
     def _wrong(self, kind: int, fields: Fields) -> str:
-        """Tell what is wrong with the values of a message of the right length, where nothing breaks."""
+        """Return what is wrong with the values of a message of the right length, where nothing breaks."""
         raise NotImplementedError
 
 
@@ -269,7 +269,7 @@ class Repeats:
         self._window_s, self._commands = 0.0, 0
 
     def cycle(self, passed_s: float, commands: int) -> str:
-        """Tell what is wrong after one more cycle, empty if nothing."""
+        """Return what is wrong after one more cycle, empty if nothing."""
         self._silent_s += passed_s
         if commands:
             self._silent_s, self._noted, self._limit_s = 0.0, False, self._times.gap_s
@@ -303,6 +303,6 @@ def end(dialect: Dialect) -> bytes:
 
 
 def _layout(kind: int, count: int) -> struct.Struct:
-    """Give the widths of a message in ``binary``; ``count``: of its fields ("Dialect `binary`")."""
+    """Return the widths of a message in ``binary``; ``count``: of its fields ("Dialect `binary`")."""
     layouts = {SCAN: f"<BII{count - 4}qII", INIT: "<B3f3i", DRIVE: "<5B", INFO: "<BB6hf", END: "<BB"}
     return struct.Struct(layouts[kind])

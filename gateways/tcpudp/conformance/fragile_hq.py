@@ -251,7 +251,7 @@ class FragileTcpUdpHq(OperatorProgram):
             self._obey(kind, body)
 
     def _untimely(self, kind: int) -> str:
-        """Tell why a packet is not due, empty if it is ("Handshake", "Translation")."""
+        """Return why a packet is not due, empty if it is ("Handshake", "Translation")."""
         phase = self._phase
         if (kind == wire.SERVER_SETTINGS) != (phase is _HqPhase.CONNECTED):
             return "a second 2" if kind == wire.SERVER_SETTINGS else f"packet {kind} before the settings 2"

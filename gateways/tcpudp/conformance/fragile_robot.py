@@ -349,7 +349,7 @@ class FragileRobot(FragileServer):
             self._start(self._send_parts(self._conn))
 
     def _loses(self) -> bool:
-        """Tell whether the connection is a poor one and loses the packet."""
+        """Return whether the connection is a poor one and loses the packet."""
         return self._poor and self._chance["loss"].random() < 0.5
 
     # Motion, maps, talk

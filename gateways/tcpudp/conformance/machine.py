@@ -93,7 +93,7 @@ class JudgedRobot:
         self.place.step(*self._drive, dt)
 
     def body(self, kind: int) -> bytes:
-        """Give the body of a packet about the robot as it is ("Packets", "Translation")."""
+        """Return the body of a packet about the robot as it is ("Packets", "Translation")."""
         if kind == wire.DEBUG:
             return string(f"battery {self._random.randint(0, 100)} %")
         if kind == wire.CHAT:
@@ -109,7 +109,7 @@ class JudgedRobot:
         return struct.pack("<i", len(self._map)) + self._map if kind == wire.MAP else b""
 
     def parts(self, count: int) -> Iterator[bytes]:
-        """Give the bodies of the map's parts; the last runs past the end of the map ("The gateway as HQ")."""
+        """Return the bodies of the map's parts; the last runs past the end of the map ("The gateway as HQ")."""
         size = len(self._map) // count + 1
         for start in range(0, len(self._map), size):
             yield struct.pack("<ii", start, start + size) + self._map[start : start + size].ljust(size, b"\0")

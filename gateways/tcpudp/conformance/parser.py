@@ -186,7 +186,7 @@ class ReadChecker:
 
 
 def due_channel(kind: int, body: bytes, *, offered: bool, works: bool | None) -> Channel | None:
-    """Tell what must carry a packet of the robot ("Packets"); None: either, as without a 6 nothing was agreed.
+    """Return what must carry a packet of the robot ("Packets"); None: either, as without a 6 nothing was agreed.
 
     ``offered``: the robot sent 4; ``works``: whether UDP was agreed, None until a 6 came.
     """
@@ -221,7 +221,7 @@ def server_settings(version: str, client: int, features: Collection[FeatureFlag]
 
 
 def announcement(version: str, features: Collection[FeatureFlag] | None, *, udp: bool) -> frozenset[FeatureFlag]:
-    """Give the flags that a robot announces, all of its version by default; raise ValueError for others."""
+    """Return the flags that a robot announces, all of its version by default; raise ValueError for others."""
     known = frozenset(list(FeatureFlag)[: FLAGS[version]])
     others = known if features is None else frozenset(features)
     if not others <= known:
@@ -269,14 +269,14 @@ def announced(body: bytes, version: str, *, skips_map_flag: bool = False) -> Rob
 
 
 def _understood(version: str, versions: str) -> str:
-    """Tell as which version's an HQ reads settings, empty if as none ("Settings and version negotiation")."""
+    """Return as which version's an HQ reads settings, empty if as none ("Settings and version negotiation")."""
     if version != "1.3":
         return version if versions == version else ""
     return next((known for known in ("1.3", "1.2", "1.1") if known in versions.split(",")), "")
 
 
 def announced_problem(settings: RobotAnnouncement, *, skips_map_flag: bool = False) -> str:
-    """Tell what is wrong with packet 2 without crippling an HQ ("Settings and version negotiation")."""
+    """Return what is wrong with packet 2 without crippling an HQ ("Settings and version negotiation")."""
     newest = max((known for known in settings.versions.split(",") if known in FLAGS), default="")
     size = FLAGS[newest] + 8 * (FLAGS[newest] == 7) if newest else len(settings.block)
     if len(settings.block) != size and not (skips_map_flag and len(settings.block) == size - 1 == 14):
@@ -285,12 +285,12 @@ def announced_problem(settings: RobotAnnouncement, *, skips_map_flag: bool = Fal
 
 
 def deadly(version: str, settings: HqAnnouncement) -> bool:
-    """Tell whether a version list crashes a robot ("Settings and version negotiation")."""
+    """Return whether a version list crashes a robot ("Settings and version negotiation")."""
     return "," in SENT[version] and settings.readable and len(settings.versions.split(",")) in DEADLY_ENTRIES
 
 
 def registered(version: str, features: Collection[FeatureFlag]) -> frozenset[int]:
-    """Tell which packet ids from the HQ do not crash a robot ("Packets", "The gateway as HQ")."""
+    """Return which packet ids from the HQ do not crash a robot ("Packets", "The gateway as HQ")."""
     ids = {DEBUG, CLIENT_SETTINGS}.union(*(_REGISTERED.get(feature, ()) for feature in features))
     if maps(version, features):
         ids |= {GET_MAP, GET_POSITION}
@@ -300,12 +300,12 @@ def registered(version: str, features: Collection[FeatureFlag]) -> frozenset[int
 
 
 def maps(version: str, features: Collection[FeatureFlag]) -> bool:
-    """Tell whether a robot knows map and position: SLAMMap where the version has that flag, else Lidar."""
+    """Return whether a robot knows map and position: SLAMMap where the version has that flag, else Lidar."""
     return (FeatureFlag.SLAM_MAP if FLAGS[version] > FeatureFlag.SLAM_MAP else FeatureFlag.LIDAR) in features
 
 
 def body_problem(kind: int, body: bytes) -> str:
-    """Tell what is wrong with a body, empty if nothing: a robot survives it, but for an empty text; an HQ does not.
+    """Return what is wrong with a body, empty if nothing: a robot survives it, but for an empty text; an HQ does not.
 
     Source: "Packets", "The gateway as robot".
     """
@@ -317,7 +317,7 @@ def body_problem(kind: int, body: bytes) -> str:
 
 
 def value_problem(kind: int, body: bytes, side: int) -> str:
-    """Tell what values a body has that the page does not know; ``side``: announced cells, 0 if none ("Packets")."""
+    """Return what values a body has that the page does not know; ``side``: announced cells, 0 if none ("Packets")."""
     if kind == LIDAR_STATUS:
         return _one_of("lidar status", (1, 2))(body)
     if kind == POSITION and not all(map(math.isfinite, struct.unpack("<3f", body))):

@@ -29,7 +29,7 @@ Decode = Callable[[bytes, int], Packet]
 
 
 def limits(gap_s: float) -> Limits:
-    """Give the bounds of a session that leaves ``gap_s`` seconds between two packets."""
+    """Return the bounds of a session that leaves ``gap_s`` seconds between two packets."""
     return Limits(frame_bytes=MAX_FRAME, handshake_s=HANDSHAKE_S, gap_s=gap_s)
 
 
@@ -42,7 +42,7 @@ def decoders(role: Role) -> dict[int, Decode]:
 
 
 def id_of(message: Packet) -> int:
-    """Give the packet id of a packet, declared or not."""
+    """Return the packet id of a packet, declared or not."""
     return message.id if isinstance(message, OpaquePacket) else message.spec.id
 
 

@@ -99,7 +99,7 @@ class ClientSource(Kept):
         self._contested = self._contested or for_good
 
     def sender_of(self, datagram: bytes) -> int:
-        """Give the ``id`` byte of a datagram; -1 if it is no packet."""
+        """Return the ``id`` byte of a datagram; -1 if it is no packet."""
         return _header(datagram)[0]
 
     def accepts_sender(self, sender_id: int) -> bool:
@@ -113,7 +113,7 @@ class ClientSource(Kept):
 
 
 def _header(datagram: bytes) -> tuple[int, int]:
-    """Give the ``id`` byte and the packet id of a datagram; -1 each if it is not one packet."""
+    """Return the ``id`` byte and the packet id of a datagram; -1 each if it is not one packet."""
     try:
         return packets.read_header(datagram)
     except ProtocolError:

@@ -116,7 +116,7 @@ class _Wc2EcReader(MessageReader[ParsedWc2EcMessage]):
         self._dialect: Dialect = dialect
 
     def _lost(self, data: bytes) -> str:
-        """Tell why the framing is lost, empty if it is not ("check the range"; "Dialect ...": the commands)."""
+        """Return why the framing is lost, empty if it is not ("check the range"; "Dialect ...": the commands)."""
         if problem := self._unknown(data[0]):
             return problem
         if self._dialect == "draft" and len(data) > 1 and data[1] != LIGHT_TYPE:
@@ -124,7 +124,7 @@ class _Wc2EcReader(MessageReader[ParsedWc2EcMessage]):
         return ""
 
     def _unknown(self, command: int) -> str:
-        """Tell why a command is not to be framed, empty if it is known."""
+        """Return why a command is not to be framed, empty if it is known."""
         raise NotImplementedError
 
     def _lose(self, problem: str, after: int) -> ParsedWc2EcMessage:

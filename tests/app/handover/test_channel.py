@@ -15,7 +15,7 @@ from zbridge.app.handover.channel import VERSION, EndError, Failed, Go, Handover
 from zbridge.errors import HandoverError
 from zbridge.transport import Parcel
 
-ENDED = "^the other side has ended$"
+ENDED = "^the other process has ended$"
 
 
 @pytest.fixture
@@ -90,7 +90,7 @@ async def test_descriptors_that_do_not_come_are_told_and_those_that_came_are_clo
             await channel.receive_parcel(2, 0.02)
         socket.send_fds(other, [b"."], [file.fileno()])
         other.sendall(b".")
-        with pytest.raises(HandoverError, match="1 descriptors came of 2"):
+        with pytest.raises(HandoverError, match="1 of 2 descriptors"):
             await channel.receive_parcel(2, 5.0)
         assert set(os.listdir("/proc/self/fd")) == before
 
@@ -100,7 +100,7 @@ async def test_a_message_that_is_not_expected_too_large_or_late_is_told(
 ) -> None:
     channel, other = ends
     HandoverChannel(other).send_now(Go())
-    with pytest.raises(HandoverError, match="Go came instead of Hello"):
+    with pytest.raises(HandoverError, match="received Go, expected Hello"):
         await channel.receive(Hello, 5.0)
     with pytest.raises(HandoverError, match=r"sent nothing for 0\.02 s"):
         await channel.receive(Hello, 0.02)
@@ -122,7 +122,7 @@ async def test_who_takes_nothing_is_told_in_time(
 ) -> None:
     for name in ("SEND_S", "REASON_S"):
         monkeypatch.setattr(channels, name, 0.02)
-    with pytest.raises(HandoverError, match="the other side is stalled: timed out"):
+    with pytest.raises(HandoverError, match="the other process is stalled: timed out"):
         await ends[0].send(HandoverState(VERSION, {"map": bytes(3 * 2**20)}, 0))
 
 

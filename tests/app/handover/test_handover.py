@@ -154,7 +154,7 @@ async def test_a_successor_that_cannot_be_told_to_go_leaves_everything_where_nob
     running = await scene.up()
     scene.successor.dies()
     scene.part.drained.set()
-    with pytest.raises(NotReady, match="the other side has ended"):
+    with pytest.raises(NotReady, match="the other process has ended"):
         await running
     assert scene.steps[-1] == "resume"
 
@@ -204,7 +204,7 @@ async def test_without_the_supervisors_ear_nothing_is_handed_over(scene: Scene) 
 async def test_a_successor_of_another_version_is_told_and_nothing_has_changed(scene: Scene) -> None:
     running = await scene.begun()
     await scene.successor.channel.send(Hello(VERSION + 1, scene.successor.process.pid))
-    told = f"the successor takes states of version {VERSION + 1}, this gateway has {VERSION}"
+    told = f"the successor accepts states of version {VERSION + 1}, this gateway has {VERSION}"
     with pytest.raises(NotReady, match=told):
         await running
     with pytest.raises(HandoverError, match=told):

@@ -54,12 +54,12 @@ async def test_state_and_descriptors_are_taken_over_together(pair: tuple[Handove
 
 
 CHANGED: list[tuple[dict[str, Any], str]] = [
-    ({"version": VERSION + 1}, f"a state of version {VERSION + 1}: this zbridge takes {VERSION}"),
-    ({"version": VERSION - 1}, f"a state of version {VERSION - 1}: this zbridge takes {VERSION}"),
-    ({"setup": {**SETUP, "hq[0]": ["tcpudp"]}}, r"hq\[0\] was changed: that needs a stop and a start"),
+    ({"version": VERSION + 1}, f"a state of version {VERSION + 1}: this zbridge accepts {VERSION}"),
+    ({"version": VERSION - 1}, f"a state of version {VERSION - 1}: this zbridge accepts {VERSION}"),
+    ({"setup": {**SETUP, "hq[0]": ["tcpudp"]}}, r"hq\[0\] was changed: stop and start the gateway instead"),
     ({"setup": {"hq[0]": ["alf"]}}, "robot was changed"),
     ({"setup": {**SETUP, "hq[1]": ["alf"]}}, r"hq\[1\] was changed"),
-    ({"descriptors": 3}, "no descriptors|descriptors came of 3"),
+    ({"descriptors": 3}, "no descriptors|of 3 descriptors"),
 ]
 
 
@@ -114,5 +114,5 @@ async def test_why_a_successor_ends_is_told(pair: tuple[HandoverChannel, Incomin
     incoming.fail("its file is wrong")
     with pytest.raises(HandoverError, match="its file is wrong"):
         await before.receive(Hello, SOON_S)
-    with pytest.raises(HandoverError, match="the other side has ended"):
+    with pytest.raises(HandoverError, match="the other process has ended"):
         await before.receive(Hello, SOON_S)

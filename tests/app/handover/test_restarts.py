@@ -132,7 +132,7 @@ async def test_who_asks_is_answered_when_everything_is_handed_over_and_the_gatew
 async def test_a_handover_that_fails_is_told_and_may_be_asked_for_again(handovers: list[PlayedOutgoing]) -> None:
     restarts, bus = made(), FakeBus()
     query = await asked(restarts, bus)
-    assert "a restart is under way" in refusal(await asked(restarts, bus))
+    assert "a restart is in progress" in refusal(await asked(restarts, bus))
     handovers[0].end.set_exception(NotReady("not restarted: the robot moves"))
     for _ in range(5):
         await asyncio.sleep(0)
@@ -142,7 +142,7 @@ async def test_a_handover_that_fails_is_told_and_may_be_asked_for_again(handover
     assert len(handovers) == 2
     handovers[1].end.set_result(7)
     await asyncio.wait_for(restarts.gone.wait(), 5.0)
-    assert "a restart is under way" in refusal(await asked(restarts, bus)), "it has gone"
+    assert "a restart is in progress" in refusal(await asked(restarts, bus)), "it has gone"
 
 
 async def test_a_restart_is_refused_with_its_reason() -> None:
@@ -152,10 +152,10 @@ async def test_a_restart_is_refused_with_its_reason() -> None:
         for restarts, told in (
             (made(successor=None), "nothing starts a successor of this process"),
             (made(planned(mode="peer", listen=["tcp/127.0.0.1:7447"])), "two processes cannot listen at one endpoint"),
-            (made(incoming=comes), "a restart is under way"),
+            (made(incoming=comes), "a restart is in progress"),
         ):
             assert told in refusal(await asked(restarts, FakeBus()))
-        assert "of one robot, in one name" in refusal(await asked(made(), FakeBus(), "fleet/*/@rpc/restart/ann"))
+        assert "one robot and one name" in refusal(await asked(made(), FakeBus(), "fleet/*/@rpc/restart/ann"))
         comes.begun.set()
         assert (await asked(made(incoming=comes), FakeBus())).replies == [], "a successor that has begun may be asked"
         comes.fail("the test ends")

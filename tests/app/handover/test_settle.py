@@ -123,7 +123,7 @@ async def test_a_robot_that_is_taken_after_the_parts_were_stopped_refuses_the_re
         restarts.device = robot  # type: ignore[assignment]
 
     part.prepare = prepare  # type: ignore[method-assign]
-    with pytest.raises(NotReady, match="the robot was taken"):
+    with pytest.raises(NotReady, match="the robot was acquired"):
         await restarts._restart()
     assert robot.steps == []
     assert part.steps == ["suspend", "resume"]

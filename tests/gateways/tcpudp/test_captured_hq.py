@@ -121,7 +121,7 @@ def test_a_captured_hq_drives_only_after_it_has_said_neutral_once(name: str) -> 
     client = captured(name)
     intent = Intent(client.listener.deadman_s)
     assert intent.choose("none", 0.0) is StickAction.NOTHING
-    owed = "connected: release the stick first"
+    owed = "connected: centre the joystick first"
     assert carried_out(intent, replay(client, name)) == [StickAction.NOTHING, owed, owed, StickAction.NOTHING]
     again = replay(client, name, late=10.0)
     assert carried_out(intent, again) == [StickAction.NOTHING, StickAction.ACQUIRE, StickAction.WAIT, StickAction.WAIT]

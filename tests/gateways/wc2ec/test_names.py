@@ -18,7 +18,7 @@ from zbridge.fleet.topics import KeySpace, Topic
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.protocol.session_table import SessionTable
-from zbridge.robot.device import Device
+from zbridge.robot.device import RobotDevice
 from zbridge.robot.names import HOUR_S, NAMES
 from zbridge.transport.conversation import Conversation
 from zbridge.transport.fake import FakeLink
@@ -56,7 +56,7 @@ class Webots:
     def __init__(self) -> None:
         self.bus, self.metrics, self.connected = CountingBus(), Metrics(), asyncio.Event()
         self.conversation: Conversation
-        self.device = Device(
+        self.device = RobotDevice(
             Wc2EcRobot(Wc2EcOptions()),
             (Address("robot.test", 27015),),
             protocol="wc2ec",

@@ -212,7 +212,7 @@ async def test_after_a_stop_a_stick_that_is_still_pushed_moves_nothing(scene: Sc
     scene.twist(1.0)
     await soon()
     scene.commands.published(scene.viewer, STOP, b"{}")
-    with pytest.raises(NeutralFirst, match="r1 was stopped; let go for a second, then drive"):
+    with pytest.raises(NeutralFirst, match="r1 was stopped; release the control for a second, then drive"):
         scene.twist(1.0)
     await soon()
     assert scene.fleet.done == [("stop", ["r1"])]

@@ -40,7 +40,7 @@ def test_a_file_cut_off_anywhere_gives_what_stands_before_the_cut(tmp_path: Path
 
 
 LIES = {
-    "no magic": (b"not MCAP at all", "no MCAP file"),
+    "no magic": (b"not MCAP at all", "not an MCAP file"),
     "a record longer than allowed": (files.record(0x05, b"", RECORD_BYTES + 1), "exceeds"),
     "a record longer than the file": (files.record(0x05, b"abc", 10_000), "cut off"),
     "a message of an unknown channel": (files.message(7), "not declared"),

@@ -20,13 +20,13 @@ STORIES: dict[str, list[tuple[float, str, str]]] = {
     ],
     "one that was there before us owes a second of silence": [
         (0, "A was there", ""),
-        (0.2, "A moves", "refuse it was there before"),
-        (1.1, "A moves", "refuse it was there before"),
+        (0.2, "A moves", "refuse it existed before"),
+        (1.1, "A moves", "refuse it existed before"),
         (2.2, "A moves", "acquire"),
     ],
     "one that was there before us and moves at once owes too": [
         (0, "A was there", ""),
-        (0.9, "A moves", "refuse it was there before"),
+        (0.9, "A moves", "refuse it existed before"),
     ],
     "or a zero": [(0, "A was there", ""), (0.2, "A rests", ""), (0.3, "A moves", "acquire")],
     "silence while it drives stops the robot, and is owed for": [

@@ -1,8 +1,8 @@
-"""A restart that no robot notices: a gateway hands its connections and its state to a successor, and goes.
+"""A restart that no robot notices: a gateway hands its connections and its state to a successor, and exits.
 
-``sequence`` has both ends, the gateway that goes and the one that comes; ``channel`` is the Unix socket between them
-and its messages, ``restarts`` what a gateway hands over and who may ask, ``processes`` how a successor is started and
-ended. ``docs/architecture.md``, "A restart", has the sequence.
+``sequence`` implements both ends, the predecessor and the successor; ``channel`` is the Unix socket between them and
+its messages, ``restarts`` what a gateway hands over and who may request it, ``processes`` how a successor is started
+and ended. ``docs/architecture.md``, "A restart", has the sequence.
 """
 
 from zbridge.app.handover.processes import Spawn, Successor

@@ -20,19 +20,19 @@ from zbridge.transport import Parcel
 from zbridge.wire.frames import Partial
 
 VERSION = 3
-"""The form of :class:`HandoverState`. Raise it with every change of what is ``kept`` and of the maps around it."""
+"""The version of :class:`HandoverState`. Increment it with every change of ``kept`` and of the maps around it."""
 M = TypeVar("M")
 
 MESSAGE_BYTES = 64 * 2**20
-"""Bound of a message: a state with the largest map takes 4 MB."""
+"""Most bytes of a message: a state with the largest map takes 4 MB."""
 REASON_S = 0.2
-"""Seconds for the reason that the other side sent before it closed."""
+"""Longest wait for the reason that the other process sent before it closed, seconds."""
 SEND_S = 5.0
-"""Longest time that a message may take to be sent."""
+"""Longest time to send a message, seconds."""
 _GROUP = 200
-"""Descriptors that are sent at a time; Linux takes 253."""
+"""Most descriptors in one message; Linux accepts 253."""
 _HEADER = 4
-_ENDED = "the other side has ended"
+_ENDED = "the other process has ended"
 
 
 class Hello(msgspec.Struct, tag="hello", frozen=True):
@@ -45,7 +45,7 @@ class Hello(msgspec.Struct, tag="hello", frozen=True):
 class HandoverState(msgspec.Struct, tag="given", frozen=True):
     """Gateway: nothing is read or written any more; take this over, and ``descriptors`` descriptors behind it.
 
-    setup: what must be the same in both configurations. claim: on the robot, None where it is not owned. device: None
+    setup: what must be the same in both configurations. claim: on the robot, None if it is not owned. device: None
     where it is not served. listeners: in the order of the configuration; none of a gateway that died: the successor
     binds its own. metrics: numbers of sockets in the parcel. partials: of a gateway that died, the incomplete frame of
     each stream, in the order of the device's links.
@@ -66,11 +66,11 @@ class Up(msgspec.Struct, tag="up", frozen=True):
 
 
 class Go(msgspec.Struct, tag="go", frozen=True):
-    """Gateway: all is yours."""
+    """Gateway: the successor has everything now."""
 
 
 class Failed(msgspec.Struct, tag="failed", frozen=True):
-    """Either: it is over, for this reason. The gateway resumes."""
+    """Either: the handover failed, for this reason. The gateway resumes."""
 
     reason: str
 
@@ -81,7 +81,7 @@ decode = msgspec.msgpack.Decoder(Message).decode
 
 
 class HandoverChannel:
-    """One end of the socket. Errors are HandoverError, with the other side's reason where it gave one."""
+    """One end of the socket. Raises HandoverError, with the other process's reason if it sent one."""
 
     def __init__(self, end: socket.socket) -> None:
         self._socket = end
@@ -95,7 +95,7 @@ class HandoverChannel:
         await asyncio.to_thread(self._send, message, parcel)
 
     async def receive(self, kind: type[M], timeout_s: float | None = None) -> M:
-        """Wait for a message of this class; None: for ever. Raise HandoverError for any other, and for an end."""
+        """Wait for a message of this class; None: forever. Raise HandoverError for any other, and at the end."""
         return await asyncio.to_thread(self._receive, kind, timeout_s)
 
     async def receive_parcel(self, descriptors: int, timeout_s: float) -> Parcel:
@@ -103,12 +103,12 @@ class HandoverChannel:
         return await asyncio.to_thread(self._receive_parcel, descriptors, timeout_s)
 
     def send_now(self, message: Message) -> None:
-        """Send a short message if the socket accepts it at once: nothing more is awaited from the other side."""
+        """Send a short message if the socket accepts it at once; expect no answer."""
         with contextlib.suppress(OSError, HandoverError):
             self._send(message, None)
 
     def close(self) -> None:
-        """End the channel, also for who waits at it; idempotent."""
+        """Close the channel, and wake who waits for it; idempotent."""
         with contextlib.suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
@@ -123,10 +123,10 @@ class HandoverChannel:
                 socket.send_fds(self._socket, [b"."], descriptors[start : start + _GROUP])
         except OSError as error:
             with contextlib.suppress(EndError, SilentError):
-                self._receive(Failed, REASON_S)  # it may have sent why it ends
+                self._receive(Failed, REASON_S)  # it may have sent its reason
             if isinstance(error, ConnectionError):
                 raise EndError(_ENDED) from error
-            raise HandoverError(f"the other side is stalled: {error}") from error
+            raise HandoverError(f"the other process is stalled: {error}") from error
 
     def _receive(self, kind: type[M], timeout_s: float | None) -> M:
         try:
@@ -136,15 +136,15 @@ class HandoverChannel:
                 raise HandoverError(f"message of {size} bytes exceeds {MESSAGE_BYTES}")
             message = decode(self._read(size))
         except TimeoutError as error:
-            raise SilentError(f"the other side sent nothing for {timeout_s:g} s") from error
-        except OSError as error:  # reset: it ended with a message of ours unread
+            raise SilentError(f"the other process sent nothing for {timeout_s:g} s") from error
+        except OSError as error:  # reset: it ended without reading our message
             raise EndError(_ENDED) from error
         except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
-            raise HandoverError(f"the other side sent an invalid message: {error}") from error
+            raise HandoverError(f"the other process sent an invalid message: {error}") from error
         if isinstance(message, Failed):
             raise HandoverError(message.reason)
         if not isinstance(message, kind):
-            raise HandoverError(f"{type(message).__name__} came instead of {kind.__name__}")
+            raise HandoverError(f"received {type(message).__name__}, expected {kind.__name__}")
         return message
 
     def _read(self, size: int) -> bytes:
@@ -164,7 +164,7 @@ class HandoverChannel:
                 data, group, _, _ = socket.recv_fds(self._socket, 1, _GROUP)
                 received += group
                 if not data or not group:
-                    raise HandoverError(f"{len(received)} descriptors came of {descriptors}")
+                    raise HandoverError(f"{len(received)} of {descriptors} descriptors were received")
         except (OSError, HandoverError) as error:
             Parcel(received).close()
             raise error if isinstance(error, HandoverError) else HandoverError(f"no descriptors: {error}") from error
@@ -174,8 +174,8 @@ class HandoverChannel:
 
 
 class EndError(HandoverError):
-    """The other side has ended without a reason."""
+    """The other process has ended without a reason."""
 
 
 class SilentError(HandoverError):
-    """The other side sends nothing in time."""
+    """The other process sent nothing in time."""

@@ -1,8 +1,7 @@
 """What a handover needs of the operating system, with a supervisor or, as here, without one.
 
-That is the socket between two processes, the end of the other process, and a successor that is started.
-
-A simulation injects its own processes in the place of :data:`PROCESSES`.
+That is: the socket between two processes, killing the other process, and starting a successor. A simulation injects its
+own processes in place of :data:`PROCESSES`.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ COMMAND = [sys.executable, "-m", "zbridge"]
 
 
 class OtherProcess:
-    """A process by its number; another one that gets the same number later is not meant."""
+    """A process by its number; never a later process with the same number."""
 
     def __init__(self, pid: int) -> None:
         self._pid = pid
@@ -41,7 +40,7 @@ class OtherProcess:
         return f"<OtherProcess {self._pid}>"
 
     async def kill(self) -> None:
-        """Kill it, and wait :data:`END_S` at most until it has ended."""
+        """Kill it, and wait at most :data:`END_S` for its end."""
         if self._descriptor is not None:
             await asyncio.to_thread(self._kill, self._descriptor)
 
@@ -58,7 +57,7 @@ class OtherProcess:
 
 
 class Processes:
-    """The processes of this machine, as one that hands over, or takes over, sees them."""
+    """The processes of this machine, as both ends of a handover use them."""
 
     @property
     def own_pid(self) -> int:
@@ -66,7 +65,7 @@ class Processes:
         return os.getpid()
 
     def pair(self) -> tuple[HandoverChannel, socket.socket]:
-        """Make a channel, and the far end of its socket for a successor; raise OSError."""
+        """Make a channel, and the far end of its socket for the successor; raise OSError."""
         near, far = socket.socketpair()
         return HandoverChannel(near), far
 
@@ -80,28 +79,28 @@ class Processes:
 
 
 PROCESSES = Processes()
-"""Those of this machine."""
+"""The processes of this machine."""
 
 
 class Successor(Protocol):
-    """Who starts successors of this process."""
+    """Starts successors of this process."""
 
     async def start_successor(self, far_end: socket.socket) -> None:
-        """Start a process that owns the far end; raise HandoverError where none can be started.
+        """Start a process that owns the far end; raise HandoverError if none can be started.
 
         The caller closes its own copy of the far end afterwards, in any case.
         """
 
     def handed_over(self) -> bool:
-        """Note that the successor has the robot from now on; called before *go* is sent to it.
+        """Record that the successor has the robot from now on; called before *go* is sent to it.
 
-        True: a supervisor stops the robot whatever happens to either process, so there is no way back. False: nobody
-        does; this process takes everything back if *go* cannot be sent.
+        True: a supervisor stops the robot whatever happens to either process, so the handover cannot be undone. False:
+        there is none; this process takes everything back if *go* cannot be sent.
         """
 
 
 class Spawn:
-    """Starts ``zbridge run FILE --take-over FD`` as a child, which lives on when this process has ended."""
+    """Starts ``zbridge run FILE --take-over FD`` as a child, which outlives this process."""
 
     def __init__(self, file: Path, *, verbose: bool = False) -> None:
         self._file = file
@@ -113,7 +112,7 @@ class Spawn:
         return f"<Spawn {self._file} {self.process.pid if self.process else ''}>"
 
     async def start_successor(self, far_end: socket.socket) -> None:
-        """Start the process; it is waited for where it ends before we do."""
+        """Start the process, and reap it if it ends before this one."""
         try:
             self.process = await asyncio.to_thread(self._start, far_end.fileno())
         except OSError as error:
@@ -131,14 +130,14 @@ class Spawn:
         return subprocess.Popen(command, pass_fds=(descriptor,))
 
     def notify_systemd(self) -> None:
-        """Tell systemd, where it started us, which process serves the robot from now on."""
+        """Notify systemd, if it started this process, which process serves the robot from now on."""
         if self.process is not None:
             Systemd().notify(f"MAINPID={self.process.pid}", waits=True)
-            self.process.returncode = 0  # it outlives us: Popen must not complain at our end
+            self.process.returncode = 0  # it outlives this process: Popen must not warn
 
 
 class Systemd:
-    """The socket that systemd named in the environment (``sd_notify``); does nothing where it named none.
+    """The notification socket of systemd (``sd_notify``); does nothing if the environment names none.
 
     watchdog_s: seconds between two notifications of the watchdog; 0: none is wanted.
     """

@@ -1,4 +1,4 @@
-"""The restarts of one gateway: who may ask for one, what is handed over (also the claim), and how it is answered."""
+"""The restarts of one gateway: who may request one, what is handed over (also the claim), and how it is answered."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Query
 from zbridge.fleet.topics import KeySpace
 from zbridge.protocol.kept import Budget, Exported
-from zbridge.robot.device import Device
+from zbridge.robot.device import RobotDevice
 from zbridge.robot.ownership import Ownership
 from zbridge.transport import Parcel, Transferable
 from zbridge.transport.kernel import KERNEL, Kernel
@@ -45,28 +45,28 @@ class ClaimPart(Transferable):
         return f"<ClaimPart {self._ownership!r}>"
 
     async def prepare(self, reason: str, within_s: float) -> None:
-        """Report the successor's claim as no rival's."""
+        """Treat the successor's claim as our own, not as a rival's."""
         self._ownership.hands_over = True
 
     def export(self, parcel: Parcel) -> Exported:
-        """Describe the claim; ``{}`` where the robot is not owned. One that was withdrawn is the successor's."""
+        """Export the claim; ``{}`` if the robot is not owned. A withdrawn claim is the successor's."""
         if not self._withdrawn:
             self._claim = self._ownership.export()
         return self._claim or {}
 
     async def restore(self, state: Exported, parcel: Parcel) -> None:
-        """Own the robot as the other process does, with a weak claim until :meth:`resume`."""
+        """Own the robot as the predecessor does, with a weak claim until :meth:`resume`."""
         self._ownership.restore(state)
 
     async def resume(self) -> None:
-        """Own the robot: again, where the claim was withdrawn, or as the process before did, which has gone."""
+        """Own the robot: again, after the claim was withdrawn, or in place of the predecessor."""
         if self._withdrawn and self._claim is not None:
             self._ownership.restore(self._claim)
         self._ownership.hands_over = self._withdrawn = False
         self._ownership.begin()
 
     async def withdraw(self) -> None:
-        """Leave the claim, and the liveliness token, to the successor's; wait until it can read the latched stops."""
+        """Leave claim and liveliness token to the successor; wait until it can read the latched stops."""
         self._withdrawn = True
         self._ownership.release()
         await self._latches.flush()
@@ -74,9 +74,9 @@ class ClaimPart(Transferable):
 
 
 class Restarts:
-    """The restarts of one gateway. The gateway enters its parts as it makes them.
+    """The restarts of one gateway, which registers its parts as it makes them.
 
-    incoming: what this gateway was handed itself. successor: starts one; None: a restart is refused. clock:
+    incoming: what this gateway itself was handed. successor: starts one; None: a restart is refused. clock:
     seconds. processes, kernel: of this machine, or simulated ones.
     """
 
@@ -94,7 +94,7 @@ class Restarts:
         self._processes = processes
         self._kernel = kernel
         self.listeners: Sequence[Transferable] = ()
-        self.device: Device | None = None
+        self.device: RobotDevice | None = None
         self.claim: ClaimPart | None = None
         self.metrics_sockets: list[socket.socket] = []
         self.gone = asyncio.Event()
@@ -113,15 +113,15 @@ class Restarts:
         return f"<Restarts of {self._keys.robot}>"
 
     async def restart(self) -> None:
-        """Hand everything to a successor and end; log the reason where that is refused."""
+        """Hand everything to a successor and end; log the reason if that is refused."""
         with contextlib.suppress(Refused):
             await self._restart()
             self.gone.set()
 
     async def settle(self) -> None:
-        """Begin no restart any more, and give up one that is under way; wait until all is taken back, or handed over.
+        """Start no further restart, and abort one in progress; wait until everything is taken back, or handed over.
 
-        To be awaited before the parts of the gateway end: two processes must not write to one socket.
+        Await this before the parts of the gateway end: two processes must not write to one socket.
         """
         self._ends = True
         if self._outgoing is not None:
@@ -138,7 +138,7 @@ class Restarts:
         return HandoverState(VERSION, self._plan.setup, len(parcel), claim=claim, device=device)
 
     def answer(self, bus: Bus) -> Handle:
-        """Restart for whoever the access rules let ask, and answer when that is done."""
+        """Restart on request of whoever the access rules permit, and answer when done."""
 
         def take(question: IncomingQuery) -> None:
             task = asyncio.ensure_future(self._restart_for(question, bus))
@@ -150,7 +150,7 @@ class Restarts:
     async def _restart_for(self, question: IncomingQuery, bus: Bus) -> None:
         try:
             if not topics.is_concrete(question.asked):
-                raise Unsupported("a restart is asked for of one robot, in one name")
+                raise Unsupported("a restart needs one robot and one name in its key")
             await self._restart()
         except Refused as refusal:
             question.refuse(refusal)
@@ -161,13 +161,13 @@ class Restarts:
         self.gone.set()
 
     async def _restart(self) -> None:
-        """Hand everything over; raise Refused with the reason, after which all is as before."""
+        """Hand everything over; raise Refused with the reason, after undoing everything."""
         if self._successor is None:
             raise Unsupported("nothing starts a successor of this process")
         if self._plan.config.bus.listen:
             raise Unsupported("[bus] listen: two processes cannot listen at one endpoint; stop this one and start it")
         if self._lock.locked() or self.gone.is_set() or not self._incoming.begun.is_set():
-            raise NotReady("a restart is under way")
+            raise NotReady("a restart is in progress")
         if self._ends:
             raise NotReady("the gateway ends")
         async with self._lock:

@@ -1,21 +1,20 @@
-"""The sequence of a handover, from both ends: the gateway that goes, and its successor. Knows no protocol.
+"""The sequence of a handover, from both ends: the predecessor and its successor. Knows no protocol.
 
-Theory of operation. The order of the steps keeps two promises: two processes never read or write one socket, and
-nothing is lost that this gateway cannot take back. :class:`~zbridge.transport.transferable.Transferable` has the steps
-of each part.
+Theory of operation. The order of the steps guarantees that two processes never read or write one socket, and that
+every step before *go* can be undone. :class:`~zbridge.transport.transferable.Transferable` has the steps of each part.
 
-1. The successor is started, reads its configuration and joins the bus. Meanwhile this gateway works as ever.
+1. The successor is started, reads its configuration and joins the bus. Meanwhile this gateway continues to work.
 2. ``prepare``, ``shut``, ``suspend``, ``export``; the state is sent.
 3. The successor calls ``restore``, declares its keys, and reports that it is up.
 4. ``withdraw``: this gateway's commands and its claim leave the bus. It sends *go*, and calls ``detach``. From *go* on
    the successor reads and writes: it calls ``resume``.
 
-Until *go* every failure leads back: the successor is killed, and only when it has ended, ``resume`` lets this gateway
+Until *go* every failure is undone: the successor is killed, and only when it has ended, ``resume`` lets this gateway
 read again. The successor reads from no socket and writes to none before *go*: a failure ends it. If this gateway dies
-once everything was handed over, the successor begins, for nobody else has the sockets.
+after it handed everything over, the successor resumes, because nobody else has the sockets.
 
-Where a supervisor started the successor, the supervisor is notified before *go* (:meth:`Successor.handed_over`). From
-then on it treats the successor as the robot's gateway, and nothing leads back. If this gateway dies before that, the
+If a supervisor started the successor, it is notified before *go* (:meth:`Successor.handed_over`). From then on it
+treats the successor as the robot's gateway, and the handover cannot be undone. If this gateway dies before that, the
 successor ends: the supervisor has the sockets too, stops the robot over them, and starts another one.
 """
 
@@ -43,20 +42,20 @@ RESTARTED = "gateway restarted"
 START_S = 30.0
 """Longest time until a successor has read its configuration and joined the bus; the robot is served meanwhile."""
 PREPARE_S = 4.0
-"""Longest time until the stop is written and all links have taken everything: a late handshake is silent for 2.5 s."""
+"""Longest time until the stop is written and all links accepted everything: a late handshake is silent for 2.5 s."""
 TAKE_OVER_S = 5.0
 """Longest time until the successor has taken everything over; nothing is read or written meanwhile."""
 STATE_S = 60.0
-"""Longest wait of a successor for the state, while the other process stops its robot."""
+"""Longest wait of a successor for the state, while the predecessor stops its robot."""
 PARCEL_S = 5.0
 GO_S = 30.0
-"""Longest wait of a successor for :class:`Go`; the other process needs milliseconds, or gives up."""
+"""Longest wait of a successor for :class:`Go`; the predecessor needs milliseconds, or gives up."""
 
 
 class Outgoing:
-    """The gateway that goes. ``successor``: starts the process that comes.
+    """The predecessor's end. ``successor``: starts the other process.
 
-    ``parts``: gives what there is to hand over now. ``describe``: exports all of it to a parcel.
+    ``parts``: returns what there is to hand over now. ``describe``: exports all of it to a parcel.
     ``processes``, ``kernel``: of this machine, or simulated ones.
     """
 
@@ -82,13 +81,13 @@ class Outgoing:
         return f"<Outgoing to {self._process}>"
 
     async def run(self) -> int:
-        """Hand everything over; return the process that has it. Raise Refused and its reason: all is as before then."""
+        """Hand everything over; return the process that has it. Raise Refused with the reason, and undo everything."""
         try:
             channel, far = self._processes.pair()
         except OSError as error:
             log.error("not restarted: %s", error)
             raise NotReady(f"not restarted: {error}") from error
-        changed = looked_after = False
+        changed = supervised = False
         try:
             with far:
                 await self._successor.start_successor(far)
@@ -101,18 +100,18 @@ class Outgoing:
             for part in self._parts:
                 await part.withdraw()
             self._require_no_end()
-            looked_after = self._successor.handed_over()
-            if not looked_after:
+            supervised = self._successor.handed_over()
+            if not supervised:
                 await channel.send(Go())
         except (HandoverError, Refused, BusError, OSError) as error:
             await self._take_back(channel, str(error), changed=changed)
             raise error if isinstance(error, Refused) else NotReady(f"not restarted: {error}") from error
-        except BaseException:  # the gateway ends meanwhile: it needs its sockets to take leave
+        except BaseException:  # the gateway ends meanwhile: it needs its sockets to say goodbye
             await asyncio.shield(self._take_back(channel, "the gateway ends", changed=changed))
             raise
         detached = asyncio.gather(*(part.detach() for part in self._parts))
-        if looked_after:
-            await asyncio.sleep(0)  # the robot's part is detached at once: an end of this process must not stop it
+        if supervised:
+            await asyncio.sleep(0)  # detach the robot at once: the end of this process must not stop it
             with contextlib.suppress(HandoverError):
                 await channel.send(Go())
         await detached
@@ -121,7 +120,7 @@ class Outgoing:
         return hello.pid
 
     def give_up(self) -> None:
-        """Give the handover up, for the gateway ends: everything is taken back, unless *go* was sent."""
+        """Abort the handover, because the gateway ends: everything is taken back, unless *go* was sent."""
         self._ends.set()
 
     def _require_no_end(self) -> None:
@@ -129,12 +128,12 @@ class Outgoing:
             raise HandoverError("the gateway ends")
 
     def _require_same_parts(self) -> None:
-        """Raise NotReady where the robot was taken, or left, since the parts were stopped."""
+        """Raise NotReady if the robot was acquired, or left, since the parts were stopped."""
         if list(self._find_parts()) != list(self._parts):
-            raise NotReady("the robot was taken, or left to another gateway, meanwhile: ask again")
+            raise NotReady("the robot was acquired or left to another gateway meanwhile: try again")
 
     async def _receive(self, channel: HandoverChannel, kind: type[M], within_s: float) -> M:
-        """Wait for a message of the successor; raise HandoverError where the gateway ends meanwhile."""
+        """Wait for a message of the successor; raise HandoverError if the gateway ends meanwhile."""
         message = asyncio.ensure_future(channel.receive(kind, within_s))
         ends = asyncio.ensure_future(self._ends.wait())
         try:
@@ -175,7 +174,7 @@ class Outgoing:
 
     def _accept(self, hello: Hello) -> None:
         if hello.version != VERSION:
-            raise HandoverError(f"the successor takes states of version {hello.version}, this gateway has {VERSION}")
+            raise HandoverError(f"the successor accepts states of version {hello.version}, this gateway has {VERSION}")
         self._process = self._processes.process(hello.pid)
 
     def _forget(self) -> None:
@@ -197,7 +196,7 @@ class Incoming:
         self.state: HandoverState
         self.parcel = Parcel()
         self.begun = asyncio.Event()
-        """Set when this process may read and write: the other one has let go."""
+        """Set when this process may read and write: the predecessor has detached."""
         self._channel = processes.channel(end)
         self._own_pid = processes.own_pid
         self._setup = setup
@@ -212,16 +211,16 @@ class Incoming:
         await self._channel.send(Hello(VERSION, self._own_pid))
         state = await self._channel.receive(HandoverState, STATE_S)
         if state.version != VERSION:
-            raise HandoverError(f"a state of version {state.version}: this zbridge takes {VERSION}")
+            raise HandoverError(f"a state of version {state.version}: this zbridge accepts {VERSION}")
         for key in sorted({*self._setup, *state.setup}):
             if state.setup.get(key) != self._setup.get(key):
-                raise HandoverError(f"{key} was changed: that needs a stop and a start")
+                raise HandoverError(f"{key} was changed: stop and start the gateway instead")
         self.parcel = await self._channel.receive_parcel(state.descriptors, PARCEL_S)
         self.state = state
         self._missing = (state.device is not None) + len(state.listeners)
 
     async def part_restored(self) -> None:
-        """Note that one part was restored; wait until all are, and the other process has let go."""
+        """Note that one part was restored; wait until all are, and the predecessor has detached."""
         self._missing -= 1
         if self._missing <= 0:
             await self.finish()
@@ -234,13 +233,13 @@ class Incoming:
             await self._channel.receive(Go, GO_S)
         except EndError as error:
             if self._supervised:
-                raise HandoverError("the gateway before this one has died: the supervisor stops its robot") from error
-            log.warning("the gateway before this one has died: continuing in its place")
+                raise HandoverError("the previous gateway died: the supervisor stops its robot") from error
+            log.warning("the previous gateway died: continuing in its place")
         self._channel.close()
         self.begun.set()
 
     def fail(self, reason: str) -> None:
-        """Report to the other process why this one ends."""
+        """Report to the predecessor why this process ends."""
         self._channel.send_now(Failed(reason))
         self._channel.close()
 

@@ -1,7 +1,7 @@
-"""What a certificate says of itself: its common name and its dates, read from its file.
+"""Reads a certificate's common name and dates from its file.
 
-Python's ``ssl`` tells that of a peer's certificate alone, and only of one that it accepts; so the few fields that are
-needed are read here. A signature is not checked here: ``ssl`` does that.
+Python's ``ssl`` reports them for a peer's certificate only, and only if it accepts that; so the few fields that are
+needed are read here. Signatures are not checked here: ``ssl`` does that.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from zbridge.errors import ConfigError
 
 _UTC_TIME, _VERSION = 0x17, 0xA0
 _COMMON_NAME = b"\x06\x03\x55\x04\x03"
-"""The object identifier 2.5.4.3, as it stands in a name."""
+"""The object identifier 2.5.4.3 (common name), DER-encoded."""
 _MOST = 65_536
-"""Bytes of a file that is read as a certificate, at most."""
+"""Most bytes of a file that is read as a certificate."""
 
 
 class Certificate(msgspec.Struct, frozen=True):
-    """What is needed of a certificate. common_name: empty if there is none."""
+    """The fields of a certificate that are needed. common_name: empty if there is none."""
 
     common_name: str
     begins: datetime
@@ -30,12 +30,12 @@ class Certificate(msgspec.Struct, frozen=True):
 
     @property
     def role(self) -> str:
-        """The role in a common name ``role.name``; empty where it is not of this form."""
+        """The role in a common name ``role.name``; empty if it is not of this form."""
         return self.common_name.partition(".")[0] if self.name else ""
 
     @property
     def name(self) -> str:
-        """The name in a common name ``role.name``; empty where it is not of this form."""
+        """The name in a common name ``role.name``; empty if it is not of this form."""
         return self.common_name.partition(".")[2]
 
 

@@ -1,4 +1,4 @@
-"""The files of one member of a secure bus: what is wrong with them, and a folder with them and its endpoints.
+"""The files of one member of a secure bus: checks them, and reads a folder with them and its endpoints.
 
 ``zbridge certs bundle`` makes such a folder: ``ca.pem``, ``certificate.pem``, ``key.pem``, and ``bus.toml``, whose
 ``[bus]`` table names the routers.
@@ -20,30 +20,30 @@ from zbridge.bus.tls.certificate import Certificate, read_certificate
 from zbridge.errors import ConfigError
 
 WARN = timedelta(days=30)
-"""How long before its end a certificate is warned of."""
+"""How long before a certificate expires there is a warning."""
 TLS_VARIABLE = "ZBRIDGE_TLS"
-"""The environment variable that names a folder, where no option does."""
+"""The environment variable that names a folder if no option does."""
 _NO_CHECK_TIME = 0x200000
 """OpenSSL's flag: a chain is checked without its dates."""
 _FLIGHTS = 10
-"""Turns within which a handshake in memory has ended."""
+"""Most rounds of a handshake in memory."""
 
 
 def folder_tls(folder: Path) -> Tls:
-    """Return the files of a folder as ``zbridge certs bundle`` makes it."""
+    """Return the files of a folder made by ``zbridge certs bundle``."""
     return Tls(str(folder / "ca.pem"), str(folder / "certificate.pem"), str(folder / "key.pem"))
 
 
 def tls_beside(tls: Tls, folder: Path) -> Tls:
-    """Return files whose relative paths are relative to a folder: that of the configuration which names them."""
+    """Resolve relative paths against a folder: that of the configuration which names them."""
     ca, certificate, key = (name and str(folder / name) for name in (tls.ca, tls.certificate, tls.key))
     return Tls(ca or tls.ca, certificate, key)
 
 
 def folder_settings(folder: Path, endpoints: Sequence[str] = ()) -> BusSettings:
-    """Return how a program joins the bus with a folder: by these endpoints, else by those of its ``bus.toml``.
+    """Return the bus settings for a folder: these endpoints, else those of its ``bus.toml``.
 
-    Raises ConfigError where there is no such folder, or neither names a router.
+    Raises ConfigError if there is no such folder, or neither names a router.
     """
     if not folder.is_dir():
         raise ConfigError(f"--tls {folder}: no such folder; expected one as `zbridge certs bundle` makes it")
@@ -66,14 +66,14 @@ def _routers(folder: Path) -> tuple[str, ...]:
 
 
 def own_certificate(tls: Tls | None) -> Certificate | None:
-    """Return what the certificate of these settings says; None where there is none; raise ConfigError."""
+    """Return the certificate of these settings; None if there is none; raise ConfigError."""
     return read_certificate(Path(tls.certificate)) if tls is not None and tls.certificate is not None else None
 
 
 def own_name(tls: Tls | None) -> str | None:
     """Return the name in the common name ``role.name`` of our certificate, to which the router binds keys.
 
-    None where there is none of this form. Raises ConfigError if the certificate cannot be read.
+    None if there is none of this form. Raises ConfigError if the certificate cannot be read.
     """
     certificate = own_certificate(tls)
     return (certificate.name or None) if certificate is not None else None
@@ -86,7 +86,7 @@ def own_role(tls: Tls | None) -> str | None:
 
 
 def unusable(tls: Tls) -> str | None:
-    """Say why no connection can be made with these files, whatever the time is; None where one can."""
+    """Return why these files allow no connection, whatever the time is; None if they do."""
     try:
         read_certificate(Path(tls.ca))
         if own_certificate(tls) is None or tls.key is None:
@@ -98,7 +98,7 @@ def unusable(tls: Tls) -> str | None:
 
 
 def out_of_date(certificate: Certificate, now: datetime) -> str | None:
-    """Say that a certificate is not valid now; None where it is."""
+    """Return why a certificate is not valid now; None if it is."""
     if certificate.ends <= now:
         renew = f"; `zbridge certs renew {certificate.name}`" if certificate.name else ""
         return f"the certificate of {certificate.common_name} expired on {certificate.ends:%Y-%m-%d %H:%M} UTC{renew}"
@@ -111,7 +111,7 @@ def out_of_date(certificate: Certificate, now: datetime) -> str | None:
 
 
 def ends_soon(certificate: Certificate, now: datetime) -> str | None:
-    """Warn of a certificate that ends within :data:`WARN`; None where it is valid for longer."""
+    """Warn of a certificate that ends within :data:`WARN`; None if it is valid for longer."""
     if now < certificate.ends - WARN:
         return None
     return out_of_date(certificate, now) or (
@@ -126,7 +126,7 @@ def utc_now() -> datetime:
 
 
 def client_context(tls: Tls) -> ssl.SSLContext:
-    """Return what a client with these files shakes hands with; raise ConfigError, which names the file."""
+    """Return the TLS context of a client with these files; raise ConfigError, which names the file."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.hostname_checks_common_name = False  # nor does Zenoh
     _load_authority(context, tls)
@@ -135,7 +135,7 @@ def client_context(tls: Tls) -> ssl.SSLContext:
 
 
 def is_of_authority(tls: Tls) -> bool:
-    """Tell whether the authority has signed the certificate, whatever the time is, by a handshake in memory."""
+    """Return whether the authority has signed the certificate, whatever the time is, by a handshake in memory."""
     server, client = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     client.check_hostname, client.verify_mode = False, ssl.CERT_NONE
     server.verify_mode = ssl.CERT_REQUIRED
@@ -166,7 +166,7 @@ def _load_own(context: ssl.SSLContext, tls: Tls) -> None:
     if tls.certificate is None or tls.key is None:
         return
     try:
-        context.load_cert_chain(tls.certificate, tls.key, password=lambda: "")  # never ask on the terminal
+        context.load_cert_chain(tls.certificate, tls.key, password=lambda: "")  # never prompt on the terminal
     except ssl.SSLError as error:
         if error.reason in ("KEY_VALUES_MISMATCH", "KEY_TYPE_MISMATCH"):
             raise ConfigError(f"{tls.key}: not the key of the certificate {tls.certificate}") from error

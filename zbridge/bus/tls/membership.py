@@ -2,8 +2,8 @@
 
 A router lets every certificate of its authority connect, and sends nothing to a name that it does not know.
 
-``zbridge router`` answers each member who it is, and nobody else may ask (``@bus/whoami/<name>``). Zenoh's own router
-answers nobody: the id of a session tells them apart.
+``zbridge router`` tells each member its role, and nobody else may ask (``@bus/whoami/<name>``). Zenoh's own router
+answers nobody; the ids of the sessions distinguish them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Membership
 
 _MARK = "7a627264"
-"""How the ids of routers that answer begin: "zbrd"."""
+"""The prefix of the ids of routers that answer: "zbrd"."""
 _ASKED = 3
 _APART_S = 0.3
 _ANSWER_S = 1.0
@@ -30,7 +30,7 @@ Ask = Callable[[str], Awaitable[list[Answer]]]
 
 
 class Right(Enum):
-    """What a program may lack the role for: what it wants to do, and the roles that may."""
+    """An action that needs a role: what it is, and the roles that permit it."""
 
     DRIVE = ("drive it", ("operator", "supervisor", "hq"))
     TAKE_OVER = ("take it over", ("supervisor",))
@@ -47,10 +47,10 @@ def router_id() -> str:
 async def require_member(
     ask: Ask, routers: Sequence[str], certificate: Certificate, realm: str, robot: str | None
 ) -> None:
-    """Raise BusRefused if the router does not know our name, or gives us no right to this robot.
+    """Raise BusRefused if the router does not know our name, or denies us this robot.
 
-    routers: the ids of the routers that we are connected to. Nothing is found out where none of them answers members,
-    or the certificate names no member.
+    routers: the ids of the routers that we are connected to. Does nothing if none of them answers members, or the
+    certificate names no member.
     """
     name = certificate.name
     if not topics.is_name(name) or not any(each.startswith(_MARK) for each in routers):
@@ -74,14 +74,13 @@ async def require_member(
 
 
 async def lacking(ask: Ask, realm: str, name: str, robot: str, right: Right) -> str | None:
-    """Say which role a program lacks; None where it has one, or nothing is known: no router answers, the bus is open.
+    """Return which role a program lacks; None if it has one, or nothing is known: no router answers, the bus is open.
 
-    Ask this when a query had no answer: what a role may not ask, a router drops without a word. name: in the
-    certificate.
+    Call this when a query had no answer: a router silently drops what a role may not query. name: in the certificate.
     """
     member = await _asked(ask, topics.whoami(realm, topics.escape(name)), 1)
     what, roles = right.value
-    if member is None or member.role == "gateway":  # which may have listeners
+    if member is None or member.role == "gateway":  # it may have listeners
         return None
     who = f"{member.role}.{member.name}"
     if member.role not in roles:

@@ -1,8 +1,8 @@
-"""Why a router was not reached: a handshake of our own, after Zenoh's failed, says which case it is.
+"""Finds out why a router was not reached, by a handshake of our own after Zenoh's failed.
 
-Zenoh's client says "Unable to connect" whatever the cause. The handshake is made with the same files by Python's
-``ssl``, on a thread of its own, and takes :data:`LONGEST_S` at most. In TLS 1.3 a server refuses a client's certificate
-only after the handshake: so one read follows.
+Zenoh's client reports "Unable to connect" whatever the cause. Python's ``ssl`` makes the handshake with the same files,
+on a thread of its own, within :data:`LONGEST_S`. In TLS 1.3 a server rejects a client's certificate only after the
+handshake, so one read follows.
 """
 
 from __future__ import annotations
@@ -23,29 +23,29 @@ from zbridge.bus.tls.files import client_context, out_of_date, own_certificate, 
 from zbridge.errors import ConfigError
 
 LONGEST_S = 3.0
-"""Longest time that finding the cause takes."""
+"""Longest time to find the cause, seconds."""
 _HANDSHAKE_S = 1.8
-"""Longest time for the handshake; what is left is for telling who it is that answers no TLS."""
+"""Longest time for the handshake, seconds; the rest is for identifying a server that does not speak TLS."""
 _PLAIN_S = 0.5
-"""Longest time for a router of plain TCP to end a connection that says nonsense."""
+"""Longest time until a router of plain TCP closes a connection that sends garbage, seconds."""
 _MOST = 4
-"""Endpoints that are tried."""
+"""Most endpoints that are tried."""
 _NO_MESSAGE = b"\x16\x03\x03\x04\x00".ljust(2 + 0x0316, b"\xff")
-"""Over plain TCP a whole frame of Zenoh's (its length comes first, 0x0316) that is no message: it ends the connection.
-For TLS the beginning of a record of 0x0400 bytes: the rest is waited for."""
+"""In plain TCP a whole Zenoh frame (its length, 0x0316, comes first) that is no message: the router disconnects. In TLS
+the beginning of a record of 0x0400 bytes: the server waits for the rest."""
 
 
 class Finding(msgspec.Struct, frozen=True):
-    """Why a router was not reached. refused: trying again soon helps nobody; else the router may just be away."""
+    """Why a router was not reached. refused: retrying soon is useless; otherwise the router may just be away."""
 
     text: str
     refused: bool = True
 
 
 async def why_not(settings: BusSettings, *, ask: bool = True) -> Finding | None:
-    """Say why none of the endpoints could be connected to; None where nothing is found to be wrong.
+    """Return why none of the endpoints could be connected to; None if nothing is found to be wrong.
 
-    ask: connect to them; else only our own files are looked at. A router pays for each connection that says nothing.
+    ask: connect to them; otherwise only our own files are checked. A silent connection costs a router time.
     """
     local = own_fault(settings.tls)
     if local is not None:
@@ -61,7 +61,7 @@ async def why_not(settings: BusSettings, *, ask: bool = True) -> Finding | None:
 
 
 def own_fault(tls: Tls | None) -> str | None:
-    """Say what is wrong with our own files; None where nothing is."""
+    """Return what is wrong with our own files; None if nothing is."""
     if tls is None:
         return None
     try:
@@ -72,7 +72,7 @@ def own_fault(tls: Tls | None) -> str | None:
 
 
 def ask_endpoint(endpoint: str, tls: Tls | None) -> Finding | None:
-    """Say why this endpoint takes no connection, by connecting to it; None where it seems to."""
+    """Connect to an endpoint; return why it accepts no connection, None if it seems to."""
     kind, _, address = endpoint.partition("/")
     host, _, port = address.partition("#")[0].partition("?")[0].rpartition(":")
     if kind not in ("tcp", "tls") or not port.isdigit():
@@ -102,7 +102,7 @@ def ask_endpoint(endpoint: str, tls: Tls | None) -> Finding | None:
 def _shake_hands(
     link: socket.socket, at: str, host: str, tls: Tls | None, kind: str, deadline: float
 ) -> Finding | None:
-    """Shake hands, and hear what the router thinks of our certificate; None where no TLS came back."""
+    """Shake hands, and return why that failed or led nowhere; None if the endpoint does not answer in TLS."""
     if tls is not None:
         context, certificate = client_context(tls), own_certificate(tls)
     else:
@@ -131,7 +131,7 @@ def _shake_hands(
 
 
 def _is_plain(host: str, port: int, deadline: float) -> bool:
-    """Tell whether nonsense ends a connection at once, or is answered: so do routers of plain TCP, and many others."""
+    """Return whether garbage ends a connection at once, or is answered, as by routers of plain TCP and many others."""
     with socket.create_connection((host, port), _left(deadline)) as link:
         link.settimeout(min(_left(deadline), _PLAIN_S))
         try:
@@ -149,13 +149,13 @@ def _tls_there(at: str) -> Finding:
 
 
 def _untrusted(error: ssl.SSLCertVerificationError, at: str, host: str, tls: Tls | None) -> str:
-    """Say why we do not accept the router's certificate."""
+    """Return why we do not accept the router's certificate."""
     why = _DISTRUST.get(error.verify_code, f"is not valid: {error.verify_message}")
     return f"the certificate of the router at {at} {why.format(host=host, ca=tls.ca if tls is not None else '')}"
 
 
 def _said_no(reason: str, at: str, certificate: Certificate | None) -> str:
-    """Say why the router does not accept ours."""
+    """Return why the router does not accept ours."""
     if certificate is None:
         return f"{at} wants a certificate, and we showed none: give --tls FOLDER, or bus.tls with certificate and key"
     why = next((text for part, text in _REFUSALS if part in reason), f"it says {reason.lower().replace('_', ' ')}")
@@ -189,14 +189,14 @@ _NO_TLS = ("WRONG_VERSION_NUMBER", "UNEXPECTED_EOF_WHILE_READING", "HTTP_REQUEST
 
 
 def _left(deadline: float) -> float:
-    """Return the seconds that are left, never none: a socket without a timeout waits for ever."""
+    """Return the seconds that are left, more than 0: a socket without a timeout waits forever."""
     return max(deadline - time.monotonic(), 0.05)
 
 
 async def _on_thread(
     work: Callable[[str, Tls | None], Finding | None], endpoint: str, tls: Tls | None
 ) -> Finding | None:
-    """Run what blocks on a thread that nobody waits for in the end; None where it takes too long, or fails itself."""
+    """Run a blocking call on a thread that may be abandoned; None if it takes too long, or fails itself."""
     loop = asyncio.get_running_loop()
     done: asyncio.Future[Finding | None] = loop.create_future()
 

@@ -1,6 +1,6 @@
-"""Watches of liveliness tokens: all who watch the same key expression share one declaration on a session.
+"""Watches of liveliness tokens: all watchers of one key expression share one declaration on a session.
 
-A watcher that comes later is told at once of the tokens that the others were told of.
+A later watcher is notified at once of the tokens that the others know.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from zbridge.bus.zenoh.declared import Undo
 log = logging.getLogger("zbridge.bus")
 
 Changed = Callable[[str, bool], None]
-"""Called with the key of a token that is there (True) or has gone (False)."""
+"""Called with the key of a token that exists (True) or has disappeared (False)."""
 
 
 class AliveWatches:
@@ -56,19 +56,19 @@ class AliveWatches:
 class _Watcher:
     def __init__(self, handler: Changed) -> None:
         self._handler = handler
-        self._told: set[str] = set()
+        self._known: set[str] = set()
         self.gone = False
 
     def greet(self, tokens: set[str]) -> None:
-        """Tell of the tokens that are there, and that it was not told of yet."""
+        """Notify a watcher of the existing tokens that it does not know yet."""
         for key in tuple(tokens):
-            if key not in self._told:
-                self.tell(key, True)
+            if key not in self._known:
+                self.notify(key, True)
 
-    def tell(self, key: str, alive: bool) -> None:
+    def notify(self, key: str, alive: bool) -> None:
         if self.gone:
             return
-        (self._told.add if alive else self._told.discard)(key)
+        (self._known.add if alive else self._known.discard)(key)
         try:
             self._handler(key, alive)
         except Exception:
@@ -76,7 +76,7 @@ class _Watcher:
 
 
 class _Watch:
-    """The tokens of one expression, and who watches them."""
+    """The tokens of one expression, and their watchers."""
 
     def __init__(self) -> None:
         self.handle: Handle | None = None
@@ -86,4 +86,4 @@ class _Watch:
     def changed(self, key: str, alive: bool) -> None:
         (self.tokens.add if alive else self.tokens.discard)(key)
         for watcher in tuple(self.watchers):
-            watcher.tell(key, alive)
+            watcher.notify(key, alive)

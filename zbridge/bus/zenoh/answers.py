@@ -2,8 +2,8 @@
 
 Theory of operation. Routers pay for every declaration of every process. Keys below an expression that
 :meth:`Answers.gather` was given share one queryable ``<expression>/**``: it is declared with the first of them and
-taken back with the last, and its callback finds the key that is asked for. A query with wildcards may ask for several:
-each answers a share of it, and the query ends with the last of them. What nobody answers for ends without a reply.
+undeclared with the last, and its callback finds the key that is queried. A query with wildcards may match several: each
+answers its share, and the query ends with the last of them. A query that no key matches ends without a reply.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from zbridge.bus.zenoh.declared import Declared, Undo
 from zbridge.fleet.topics import is_concrete
 
 Take = Callable[[Any], None]
-"""Takes a query on Zenoh's threads; must not block."""
+"""Handles a query on Zenoh's threads; must not block."""
 _BELOW = "/**"
 _FAMILY = "/*"
 
@@ -36,13 +36,13 @@ class Answers:
         return f"<Answers {self._gathered}>"
 
     def gather(self, key_expr: str) -> Handle:
-        """Answer for all keys below ``key_expr``, which ends with ``/**``, by one queryable from now on."""
+        """Answer for all keys below ``key_expr``, which ends with ``/**``, with one queryable from now on."""
         gathered = _Gathered(self._session, key_expr)
         self._gathered.append(gathered)
         return Undo(lambda: self._gathered.remove(gathered))
 
     def add(self, key: str, take: Take) -> Handle:
-        """Give the queries for ``key``, whose last chunk may be ``*``, to ``take``."""
+        """Pass queries for ``key``, whose last chunk may be ``*``, to ``take``."""
         for gathered in self._gathered:
             if key.startswith(gathered.prefix):
                 return gathered.add(key, take)

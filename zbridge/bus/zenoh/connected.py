@@ -1,7 +1,7 @@
 """Whether a session is connected to the bus.
 
-Zenoh tells that a connection is gone before its own list shows it: who read the list at that moment would take a lost
-bus for a connected one, for good. So what was just told is trusted, and the list is looked at a few times more.
+Zenoh reports the end of a connection before its own list shows it: a reader of the list at that moment would mistake a
+lost bus for a connected one, forever. So the report is trusted, and the list is polled a few times more.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import zenoh
 
 from zbridge.bus.zenoh.declared import Declared, threadless
 
-LOOK_AGAIN_S = (0.1, 0.5, 2.0, 10.0)
-"""Seconds after the end of a connection: the list is right by then, the later the busier the machine."""
+POLL_S = (0.1, 0.5, 2.0, 10.0)
+"""Seconds after the end of a connection at which the list is polled: on a busy machine it is right only later."""
 
 
 class ConnectedWatch:
@@ -29,12 +29,12 @@ class ConnectedWatch:
         self._info = info
         self._loop = loop
         self._handler = handler
-        self._told = False
-        self._looks: list[asyncio.TimerHandle] = []
+        self._reported = False
+        self._polls: list[asyncio.TimerHandle] = []
         self._declared = Declared(info.declare_transport_events_listener(threadless(self._changed), history=True))
 
     def __repr__(self) -> str:
-        return f"<ConnectedWatch {'connected' if self._told else 'not connected'}>"
+        return f"<ConnectedWatch {'connected' if self._reported else 'not connected'}>"
 
     @property
     def closed(self) -> bool:
@@ -44,31 +44,31 @@ class ConnectedWatch:
     def close(self) -> None:
         """Call the handler no more; idempotent."""
         self._declared.close()
-        self._forget_looks()
+        self._cancel_polls()
 
     def _changed(self, event: zenoh.TransportEvent) -> None:
-        """Take an event, on one of Zenoh's threads."""
+        """Handle an event, on one of Zenoh's threads."""
         gone = str(event.transport.zid) if event.kind == zenoh.SampleKind.DELETE else None
-        here = gone is None or any(str(transport.zid) != gone for transport in self._info.transports())
+        connected = gone is None or any(str(transport.zid) != gone for transport in self._info.transports())
         with contextlib.suppress(RuntimeError):  # the loop has ended
-            self._loop.call_soon_threadsafe(self._take, here, gone is not None)
+            self._loop.call_soon_threadsafe(self._on_change, connected, gone is not None)
 
-    def _take(self, here: bool, lost: bool) -> None:
-        self._forget_looks()
-        self._tell(here)
+    def _on_change(self, connected: bool, lost: bool) -> None:
+        self._cancel_polls()
+        self._report(connected)
         if lost and not self.closed:
-            self._looks = [self._loop.call_later(after_s, self._look) for after_s in LOOK_AGAIN_S]
+            self._polls = [self._loop.call_later(after_s, self._poll) for after_s in POLL_S]
 
-    def _look(self) -> None:
+    def _poll(self) -> None:
         with contextlib.suppress(zenoh.ZError):  # the session has ended
-            self._tell(bool(self._info.transports()))
+            self._report(bool(self._info.transports()))
 
-    def _tell(self, here: bool) -> None:
-        if here is not self._told and not self.closed:
-            self._told = here
-            self._handler(here)
+    def _report(self, connected: bool) -> None:
+        if connected is not self._reported and not self.closed:
+            self._reported = connected
+            self._handler(connected)
 
-    def _forget_looks(self) -> None:
-        looks, self._looks = self._looks, []
-        for look in looks:
-            look.cancel()
+    def _cancel_polls(self) -> None:
+        polls, self._polls = self._polls, []
+        for poll in polls:
+            poll.cancel()

@@ -1,7 +1,7 @@
-"""Declares callbacks on a Zenoh session, and takes back what was declared on it.
+"""Declares callbacks on a Zenoh session, and undeclares them.
 
-Zenoh refuses to undeclare an entity whose callback runs at that moment ("Already borrowed"), so that is tried again: a
-few times at once, then by a thread of its own.
+Zenoh refuses to undeclare an entity whose callback runs at that moment ("Already borrowed"), so that is retried: a
+few times at once, then on a thread of its own.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ import zenoh
 log = logging.getLogger("zbridge.bus")
 
 UNDECLARE_S = 1.0
-"""Longest time for which undeclaring an entity is tried while its callback runs on."""
+"""Longest time for which undeclaring an entity is retried while its callback keeps running."""
 _TRIES_AT_ONCE, _PAUSE_S = 4, 0.0005
-"""Tries of the calling thread, which may be the event loop's, and the pause between two tries, seconds."""
+"""Attempts on the calling thread, which may be the event loop's, and the pause between two attempts, seconds."""
 KNOWN_THREADS = 64
-"""Threads of Zenoh's whose state Python keeps: 16 kB each. Two or three bring all samples of a process."""
+"""Zenoh's threads whose state Python keeps: 16 kB each. Two or three deliver all samples of a process."""
 
 _keep_state = ctypes.pythonapi.PyGILState_Ensure
 _here = threading.local()
@@ -31,12 +31,12 @@ _known = itertools.count()
 
 
 def threadless(callback: Callable[[Any], object]) -> zenoh.handlers.Callback[Any]:
-    """Let Zenoh's own thread call back, for what is rare and returns at once; else each callback gets a thread."""
+    """Let Zenoh's own thread call back: for rare calls that return at once; otherwise each callback gets a thread."""
     return zenoh.handlers.Callback(callback, indirect=False)
 
 
 def prompt(callback: Callable[[Any], object]) -> zenoh.handlers.Callback[Any]:
-    """Let Zenoh's own thread call back, for what is frequent, returns at once and must not wait for another thread."""
+    """Let Zenoh's own thread call back: for frequent calls that return at once and must not wait for another thread."""
 
     def called(raw: Any) -> None:
         if not hasattr(_here, "known"):
@@ -47,10 +47,10 @@ def prompt(callback: Callable[[Any], object]) -> zenoh.handlers.Callback[Any]:
 
 
 def keep_thread() -> None:
-    """Let Python keep its state of this thread, which is not one of its own, for the next call.
+    """Make Python keep its state of this foreign thread for the next call.
 
-    Python makes and frees that state, with a stack that is mapped anew, for each call: 20 us. A reference too many,
-    which is never given back, keeps it.
+    Otherwise Python creates and frees that state, with a newly mapped stack, for each call: 20 us. An extra reference
+    that is never released keeps it.
     """
     _here.known = True
     if next(_known) < KNOWN_THREADS:
@@ -65,7 +65,7 @@ class Declared:
 
     @property
     def closed(self) -> bool:
-        """Whether the entities were taken back."""
+        """Whether the entities were undeclared."""
         return not self._entities
 
     def close(self) -> None:
@@ -94,7 +94,7 @@ class Undo:
 
 
 def _undeclare_soon(entity: Any) -> None:
-    """Undeclare an entity, here within 2 ms or else by a thread of its own within :data:`UNDECLARE_S`."""
+    """Undeclare an entity, here within 2 ms, or else on a thread of its own within :data:`UNDECLARE_S`."""
     for attempt in range(_TRIES_AT_ONCE):
         if attempt:
             time.sleep(_PAUSE_S)
@@ -109,11 +109,11 @@ def _undeclare_later(entity: Any) -> None:
         time.sleep(_PAUSE_S)
         if _undeclare(entity):
             return
-    log.error("%s was not taken back: Already borrowed for %g s", type(entity).__name__, UNDECLARE_S)
+    log.error("%s could not be undeclared: Already borrowed for %g s", type(entity).__name__, UNDECLARE_S)
 
 
 def _undeclare(entity: Any) -> bool:
-    """Undeclare an entity; False where its own callback runs and it must be tried again."""
+    """Undeclare an entity; False if its own callback runs and it must be tried again."""
     try:
         entity.undeclare()
     except RuntimeError as error:

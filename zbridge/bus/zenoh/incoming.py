@@ -1,7 +1,7 @@
 """What comes in from Zenoh: samples, queries, changes of liveliness, and replies to our own queries.
 
 The functions that ``*_callback`` return run on Zenoh's threads. They choose a priority, copy what the event loop needs
-and put it into the inbox, or call a handler that wants to be called there.
+and put it into the inbox, or call a handler that asked for that.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def direct_callback(key_expr: str, handler: Callable[[Sample], None]) -> Callabl
 
 
 def sorted_callback(sort: Sort, source: Source) -> Callable[[zenoh.Sample], None]:
-    """Make the callback of samples that are sorted before the event loop hears of them."""
+    """Make the callback of samples that are sorted before they reach the event loop."""
 
     def store(sample: zenoh.Sample) -> None:
         attachment, payload = sample.attachment, sample.payload
@@ -87,13 +87,13 @@ def sorted_callback(sort: Sort, source: Source) -> Callable[[zenoh.Sample], None
 
 
 def subscribe_with_kept(session: zenoh.Session, key_expr: str, store: Any) -> Any:
-    """Subscribe to a key and to what advanced publishers have kept of it, now and whenever one appears."""
+    """Subscribe to a key, and to the samples that advanced publishers keep, now and whenever one appears."""
     history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
     return zenoh.ext.declare_advanced_subscriber(session, key_expr, store, history=history)
 
 
 def query_callback(sort: Sort, source: Source, unanswered: Count) -> Callable[[zenoh.Query], None]:
-    """Make the callback of queries that are sorted before the event loop hears of them."""
+    """Make the callback of queries that are sorted before they reach the event loop."""
 
     def store(query: zenoh.Query) -> None:
         payload = query.payload
@@ -161,10 +161,10 @@ class ZenohQuery:
 
 
 class Replies(list[zenoh.Reply]):
-    """The replies to one query of ours, within bounds; taken on Zenoh's threads.
+    """The replies to one query of ours, within bounds; collected on Zenoh's threads.
 
-    A flood of one session's replies must not hide another's. A session that answers for one key has little to say; one
-    that answers for many may answer for a whole fleet.
+    A flood of one session's replies must not hide another's. A session that answers for one key sends few replies;
+    one that answers for many may answer for a whole fleet.
     """
 
     def __init__(self, key_expr: str, dropped: Count) -> None:
@@ -192,7 +192,7 @@ def read_reply(reply: zenoh.Reply) -> Answer:
 
 
 def read_error(payload: bytes) -> Refused | BusError:
-    """Read an error reply: a refusal has a code, anything else is a text of the bus's own."""
+    """Read an error reply: a refusal has a code, anything else is a text of Zenoh's."""
     try:
         denied = payloads.decode(Denied, payload)
     except PayloadError:

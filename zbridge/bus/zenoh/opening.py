@@ -1,4 +1,4 @@
-"""A Zenoh session is opened: how settings become Zenoh's configuration, and why it was not opened."""
+"""Opens a Zenoh session: converts settings to Zenoh's configuration, and explains failures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from zbridge.errors import BusError, BusRefused
 from zbridge.fleet.topics import SizeBounds
 
 RETRY_FIRST_MS, RETRY_MOST_MS, RETRY_FACTOR = (500, 1500), (2000, 4000), 1.5
-"""Milliseconds between attempts to connect to a router that was lost: first, at most, and by what they grow."""
+"""Milliseconds between attempts to reconnect to a router: the first pause, the longest, and the growth factor."""
 _INGRESS = ("ingress",)
 _BOUNDED = ("put", "delete", "query")
 _ORIGIN = re.compile(r"\s+at /.*", re.DOTALL)
@@ -32,16 +32,16 @@ def zenoh_config(
     within_s: float = 1.0,
     timestamps: bool = False,
 ) -> zenoh.Config:
-    """Write settings as a Zenoh configuration; raise BusError naming the setting that Zenoh refuses.
+    """Convert settings to a Zenoh configuration; raise BusError naming the setting that Zenoh rejects.
 
-    within_s: longest time an attempt to open a client session takes.
+    within_s: time limit of an attempt to open a client session.
     """
     values: dict[str, Any] = {
         "mode": settings.effective_mode,
         "connect/endpoints": settings.connect,
         "scouting/multicast/enabled": settings.multicast,
         "open/return_conditions/connect_scouted": wait_for_peers,
-        # A pool of 28 MB in every process, for payloads larger than a robot has.
+        # A pool of 28 MB in every process, for payloads larger than any robot's.
         "transport/shared_memory/enabled": False,
         **FULL_QUEUES,
     }
@@ -61,13 +61,13 @@ def zenoh_config(
 
 
 def _retry() -> dict[str, float]:
-    """Choose the times between attempts to connect, another for each session: a thousand may have lost one router."""
+    """Choose the pauses between attempts to connect, at random: a thousand sessions may have lost one router."""
     first_ms, most_ms = random.randint(*RETRY_FIRST_MS), random.randint(*RETRY_MOST_MS)
     return {"period_init_ms": first_ms, "period_max_ms": most_ms, "period_increase_factor": RETRY_FACTOR}
 
 
 def write_config(values: Mapping[str, Any]) -> zenoh.Config:
-    """Write values as a Zenoh configuration; raise BusError naming the one that Zenoh refuses."""
+    """Convert values to a Zenoh configuration; raise BusError naming the one that Zenoh rejects."""
     config = zenoh.Config()
     for key, value in values.items():
         try:
@@ -78,7 +78,7 @@ def write_config(values: Mapping[str, Any]) -> zenoh.Config:
 
 
 def _size_filters(bounds: SizeBounds) -> list[dict[str, Any]]:
-    """Write the filters by which Zenoh drops input that is larger than its key allows."""
+    """Make the filters by which Zenoh drops input that is larger than its key allows."""
     return [
         {"id": str(number), "flows": _INGRESS, "messages": _BOUNDED, "key_exprs": key_exprs, "size_limit": most_bytes}
         for number, (key_exprs, most_bytes) in enumerate(bounds)
@@ -86,7 +86,7 @@ def _size_filters(bounds: SizeBounds) -> list[dict[str, Any]]:
 
 
 def _secure_values(tls: Tls) -> dict[str, Any]:
-    """Write what holds with certificates: nobody is found by chance, nothing goes in the open, names are verified."""
+    """Make the settings for certificates: no scouting, no plain TCP, verified names."""
     at = "transport/link/tls"
     values: dict[str, Any] = {
         "scouting/multicast/enabled": False,
@@ -117,10 +117,10 @@ def canonical(key_expr: str) -> str:
         raise ValueError(in_short(error).removeprefix(f"Invalid Key Expr `{key_expr}`: ")) from error
 
 
-async def open_or_say_why(config: zenoh.Config, settings: BusSettings, *, explain: bool = True) -> zenoh.Session:
-    """Open a session; raise BusError, which says which case it is where that can be found.
+async def open_or_explain(config: zenoh.Config, settings: BusSettings, *, explain: bool = True) -> zenoh.Session:
+    """Open a session; raise BusError, which names the cause if that can be found.
 
-    explain: whether the router may be asked; else only our own files are looked at.
+    explain: whether the router may be contacted; otherwise only our own files are checked.
     """
     try:
         return await open_session(config)
@@ -133,7 +133,7 @@ async def open_or_say_why(config: zenoh.Config, settings: BusSettings, *, explai
 
 
 async def open_session(config: zenoh.Config) -> zenoh.Session:
-    """Open a session; raise BusError where that is not possible."""
+    """Open a session; raise BusError if that is not possible."""
     try:
         return await asyncio.to_thread(zenoh.open, config)
     except zenoh.ZError as error:

@@ -21,11 +21,12 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet.topics import Congestion, Delivery, Priority, QoS, Topic
 
 STREAM_PUBLISHERS = 300
-"""Different stream keys that get publishers: Zenoh keeps 1.5 kB of each for ever, here and in every router, and finds
-others more slowly. Later ones are declared as keys only: that takes 0.5 us more for each message."""
+"""Stream keys that get publishers: Zenoh keeps 1.5 kB of each forever, here and in every router, and finds others more
+slowly. Later ones are declared as keys only, which costs 0.5 us more per message."""
 
 KEPT_TOLD_S = 2.0
-"""Seconds after which the number of the last kept frame is told, so that who lost it asks for it: a timer a key."""
+"""Seconds after which the number of the last kept frame is announced, so that subscribers that lost it query it; one
+timer per key."""
 
 
 class Publishers:
@@ -71,7 +72,7 @@ class Publishers:
 
 
 class PlainPublisher(Declared):
-    """Writes a key directly, or by a writer thread where a full queue blocks."""
+    """Writes a key directly, or on a writer thread if a full queue blocks."""
 
     def __init__(self, key: str, publisher: zenoh.Publisher, writer: Writer | None, *watches: Any) -> None:
         """Begin. watches: what is undeclared with the publisher."""
@@ -90,10 +91,10 @@ class PlainPublisher(Declared):
 
 
 class FramePublisher(Declared):
-    """Writes frames of any format on a key, and tells when the first listener comes and the last one goes.
+    """Writes frames of any format on a key, and reports when the first listener appears and the last one leaves.
 
-    kept: last frames that advanced subscribers get when they come late, and which they may ask for if one was lost.
-    blocks: a congested bus holds frames up, in place of dropping them.
+    kept: last frames that late advanced subscribers get, and may query if one was lost. blocks: a congested bus delays
+    frames instead of dropping them.
     """
 
     def __init__(
@@ -163,14 +164,14 @@ class _StreamPublisher(Declared):
         return self._writer.put(partial(self.put_express, payload, attachment=attachment))
 
     def close(self) -> None:
-        if self._blocks:  # what waits to be written is not lost
+        if self._blocks:  # what waits is still written
             self._writer.put(super().close)
         else:
             super().close()
 
 
 class _NewestPublisher(Declared):
-    """Writes a stream of large messages, always on the writer's thread; of those that wait only the newest is put."""
+    """Writes a stream of large messages, always on the writer's thread; of those waiting only the newest is put."""
 
     def __init__(self, session: zenoh.Session, key: str, options: dict[str, Any], writer: Writer) -> None:
         self.key = key
@@ -184,7 +185,7 @@ class _NewestPublisher(Declared):
 
 
 class _StreamKey(_StreamPublisher):
-    """Writes a stream key that Zenoh is to forget when it is closed."""
+    """Writes a stream key that Zenoh must forget when it is closed."""
 
     def _declare(self, session: zenoh.Session, key: str, options: dict[str, Any]) -> tuple[Any, ...]:
         expression = session.declare_keyexpr(key)
@@ -194,7 +195,7 @@ class _StreamKey(_StreamPublisher):
 
 
 class _Undeclared(msgspec.Struct):
-    """Something that is undeclared by a call."""
+    """Something that a call undeclares."""
 
     undeclare: Callable[[], object]
 
@@ -222,7 +223,7 @@ class _LastValues:
         return self._values.get(key)
 
     def forget(self, key: str) -> None:
-        """Answer for a key no longer, and for none of its robot's after the last of them."""
+        """Stop answering for a key, and after a robot's last key for that robot."""
         self._values.pop(key, None)
         self._encodings.pop(key, None)
         robot, _, _ = key.rpartition("/")

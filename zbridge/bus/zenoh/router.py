@@ -1,4 +1,4 @@
-"""Opens a Zenoh router in this process, and hears of its neighbours and of what Zenoh's own log says."""
+"""Opens a Zenoh router in this process; watches its neighbours and Zenoh's own log."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from zbridge.bus.zenoh.session import ZenohBus
 from zbridge.metrics import Metrics
 
 LOG_LEVEL = "warn"
-"""What of Zenoh's log is heard, unless the environment variable ``RUST_LOG`` says otherwise."""
+"""The part of Zenoh's log that is read, unless the environment variable ``RUST_LOG`` says otherwise."""
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 
 
 async def open_router(
     values: Mapping[str, Any], metrics: Metrics, on_neighbour: Callable[[Neighbour, bool], None]
 ) -> ZenohBus:
-    """Open a router; raise BusError where that is not possible."""
+    """Open a router; raise BusError if that is not possible."""
     values = {**values, "id": router_id()}
     router = ZenohRouter(await open_session(write_config(values)), asyncio.get_running_loop(), metrics)
     router.watch_neighbours(on_neighbour)
@@ -36,7 +36,7 @@ async def open_router(
 
 
 class ZenohRouter(ZenohBus):
-    """The bus as the router's own process uses it. What it declares itself is under no access rule."""
+    """The bus as the router's own process uses it. Access rules do not apply to its own declarations."""
 
     def watch_neighbours(self, handler: Callable[[Neighbour, bool], None]) -> None:
         """Call ``handler`` with every process that connects (True) or leaves (False)."""
@@ -51,8 +51,8 @@ class ZenohRouter(ZenohBus):
         self._keep(Declared(self._session.info.declare_link_events_listener(threadless(changed), history=True)))
 
 
-def hear_log(handler: Callable[[str], None]) -> None:
-    """Start Zenoh's log and give its lines to ``handler``, without colours, on a thread of its own.
+def read_log(handler: Callable[[str], None]) -> None:
+    """Start Zenoh's log and pass its lines to ``handler``, without colours, on a thread of its own.
 
     Zenoh writes to standard output: that becomes a pipe, and what Python prints is still written where it was before.
     """
@@ -63,10 +63,10 @@ def hear_log(handler: Callable[[str], None]) -> None:
     os.close(write)
     sys.stdout = open(own, "w", encoding="utf-8", errors="replace", buffering=1)  # noqa: SIM115 - for the whole process
 
-    def hear() -> None:
+    def read_lines() -> None:
         with open(read, encoding="utf-8", errors="replace") as lines:
             for line in lines:
                 handler(_COLOUR.sub("", line).rstrip("\n"))
 
-    threading.Thread(target=hear, name="zbridge-zenoh-log", daemon=True).start()
+    threading.Thread(target=read_lines, name="zbridge-zenoh-log", daemon=True).start()
     zenoh.init_log_from_env_or(LOG_LEVEL)

@@ -32,7 +32,7 @@ from zbridge.bus.zenoh.incoming import (
     read_reply,
     subscribe_with_kept,
 )
-from zbridge.bus.zenoh.opening import in_short, open_or_say_why, zenoh_config
+from zbridge.bus.zenoh.opening import in_short, open_or_explain, zenoh_config
 from zbridge.bus.zenoh.publishers import FramePublisher, Publishers
 from zbridge.errors import BusError
 from zbridge.fleet.topics import SizeBounds, Topic
@@ -41,9 +41,9 @@ from zbridge.metrics import Metrics
 H = TypeVar("H", bound=Handle)
 
 LEAVE_S = 0.4
-"""Longest time leaving the bus takes."""
+"""Longest time to leave the bus, seconds."""
 FLUSH_S = 2.0
-"""Longest time for which :meth:`ZenohBus.flush` waits."""
+"""Longest wait of :meth:`ZenohBus.flush`, seconds."""
 _TIDY = 64
 """Handles that are kept before closed ones are forgotten."""
 
@@ -61,11 +61,11 @@ async def open_zenoh(
     explain: bool = True,
     threads: bool = True,
 ) -> ZenohBus:
-    """Open a Zenoh session; raise BusError where that is not possible (a client: no router within ``within_s``)."""
+    """Open a Zenoh session; raise BusError if that is not possible (a client: no router within ``within_s``)."""
     config = zenoh_config(
         settings, wait_for_peers=wait_for_peers, bounds=bounds, within_s=within_s, timestamps=timestamps
     )
-    session = await open_or_say_why(config, settings, explain=explain)
+    session = await open_or_explain(config, settings, explain=explain)
     bus = ZenohBus(session, asyncio.get_running_loop(), metrics, stream=settings.stream, threads=threads)
     certificate = own_certificate(settings.tls)
     if certificate is not None and realm is not None:
@@ -90,7 +90,7 @@ class ZenohBus:
         threads: bool = True,
         beside: ZenohBus | None = None,
     ) -> None:
-        """Begin. beside: a bus whose session this one shares and does not end."""
+        """Begin. beside: a bus whose session this one shares and does not close."""
         self._session = session
         self._threads = threads
         self._loop = loop
@@ -99,7 +99,7 @@ class ZenohBus:
         self._shares = beside is not None
         self._inbox = Inbox(loop, metrics)
         self._inboxes: list[Inbox] = beside._inboxes if beside is not None else []
-        """Of all that share the session: what is urgent to one of them is served with all."""
+        """The inboxes of all that share the session: urgent input of one is served with that of all."""
         self._inboxes.append(self._inbox)
         self._answers = Answers(session)
         self._alive = AliveWatches(loop, self._declare_alive)
@@ -128,12 +128,12 @@ class ZenohBus:
     def share(self, metrics: Metrics) -> ZenohBus:
         """Return a bus on the same session for one robot, with queues, bounds, threads and declarations of its own.
 
-        Its ``close`` takes back what was declared on it, and leaves the session to the others.
+        Its ``close`` undeclares what was declared on it, and leaves the session to the others.
         """
         return ZenohBus(self._session, self._loop, metrics, stream=self._stream, threads=self._threads, beside=self)
 
     def publisher(self, key: str, topic: Topic, last: bytes | None = None) -> Publisher:
-        """Declare that ``key`` will be written. last: what another process published last, for keys that keep it."""
+        """Declare a publisher of ``key``. last: what another process published last, for keys that keep it."""
         return self._keep(self._publishers.make(key, topic, last))
 
     def on_relief(self, handler: Callable[[], None]) -> None:
@@ -152,12 +152,12 @@ class ZenohBus:
     ) -> Handle:
         """Subscribe to ``key_expr``.
 
-        priority: of all samples, or a Sort that chooses it for each. history: ask for last values too.
-        kept: the frames that publishers have kept come too, those of publishers that appear later as well.
+        priority: of all samples, or a Sort that chooses it for each. history: query last values too.
+        kept: also receive the frames that publishers keep, including publishers that appear later.
         direct: the handler is called on one of Zenoh's threads, for streams without priority and history: it must be
         quick, and may put frames on another bus.
 
-        Of the samples that a Sort gives priority STOP only one waits at a time: those that follow are the same stop.
+        Of the samples that a Sort gives priority STOP only one waits at a time, because they are all the same stop.
         """
         if history:
             return self._keep(LateJoin(self, key_expr, handler))
@@ -214,7 +214,7 @@ class ZenohBus:
         return [read_reply(reply) for reply in replies]
 
     def attend(self) -> None:
-        """Serve the stops and the holder's commands that wait. To be called in the middle of long work."""
+        """Serve the stops and the holder's commands that wait. Call it in the middle of long work."""
         for inbox in self._inboxes:
             inbox.attend()
 
@@ -243,7 +243,7 @@ class ZenohBus:
         await self._flush(self._writer)
 
     async def drain(self, key_expr: str) -> None:
-        """Wait until all that was published has left: a query of the lowest priority goes behind it."""
+        """Wait until all that was published has left: a query of the lowest priority follows it."""
         await self._flush(self._streams)
         options: Any = {"priority": zenoh.Priority.BACKGROUND, "congestion_control": zenoh.CongestionControl.BLOCK}
         await self._collect(key_expr, lambda handler: self._session.get(key_expr, handler, timeout=1.0, **options), 1.0)
@@ -264,15 +264,15 @@ class ZenohBus:
             async with asyncio.timeout(FLUSH_S):
                 await written
         except TimeoutError:
-            raise BusError(f"the bus took nothing for {FLUSH_S:g} s") from None
+            raise BusError(f"the bus accepted nothing for {FLUSH_S:g} s") from None
 
     def frames(
         self, key: str, listened: Callable[[bool], None], *, best_effort: bool = False, kept: int = 0
     ) -> Publisher:
-        """Declare a key for raw frames; call ``listened`` when the first listener comes and the last one goes.
+        """Declare a key for raw frames; call ``listened`` when the first listener appears and the last one leaves.
 
-        best_effort: links may lose frames. kept: last frames that Zenoh's advanced subscribers get when they come late;
-        needs a bus with timestamps.
+        best_effort: links may lose frames. kept: last frames that late advanced subscribers of Zenoh get; needs a bus
+        with timestamps.
         """
 
         def changed(matching: bool) -> None:
@@ -293,7 +293,7 @@ class ZenohBus:
         return self._keep(ConnectedWatch(self._session.info, self._loop, handler))
 
     async def close(self) -> bool:
-        """Leave the bus within :data:`LEAVE_S`; False where that hangs, as with a router that has stalled."""
+        """Leave the bus within :data:`LEAVE_S`; False if that hangs, as with a router that has stalled."""
         handles, self._handles = self._handles, []
         if self._inbox in self._inboxes:
             self._inboxes.remove(self._inbox)
@@ -324,7 +324,7 @@ class ZenohBus:
                 self._loop.call_soon_threadsafe(handler)
 
     def _keep(self, handle: H) -> H:
-        """Remember a handle that is to be closed at the end; forget closed ones now and then, so that none add up."""
+        """Remember a handle to close at the end; forget closed ones now and then, so that they do not accumulate."""
         self._handles.append(handle)
         if len(self._handles) >= self._tidy_at:
             self._handles = [kept for kept in self._handles if not getattr(kept, "closed", False)]

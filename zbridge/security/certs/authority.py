@@ -23,7 +23,7 @@ AUTHORITY_DAYS = 3650
 DAYS = 365
 """How long a certificate is valid, by default."""
 SOON = timedelta(days=30)
-"""How long before its end a certificate is due to be renewed."""
+"""How long before its expiry a certificate should be renewed."""
 
 
 def load_authority(folder: Folder, now: datetime) -> x509.CertificateAuthority:
@@ -45,7 +45,7 @@ def load_name(folder: Folder, name: str) -> tuple[EllipticCurvePrivateKey, Certi
 
 
 def fault(certificate: Certificate, authority: Certificate, expected: str, now: datetime) -> str:
-    """Say why a certificate would be refused, or be nobody's; empty: it would not. expected: its common name."""
+    """Return why a certificate would be refused, or belongs to nobody; empty: it is good. expected: its common name."""
     if not x509.issued_by(certificate, authority):
         return "issued by another authority"
     if (found := x509.common_name_of(certificate)) != expected:
@@ -65,7 +65,7 @@ def _matching_key(path: Path, certificate: Certificate) -> EllipticCurvePrivateK
 
 
 class CertificateRequest(msgspec.Struct, frozen=True):
-    """What is to be issued. hosts: where a server with this certificate is reached; a router has at least one."""
+    """A request to issue. hosts: names of a server with this certificate; a router has at least one."""
 
     name: str
     member: Member
@@ -74,7 +74,7 @@ class CertificateRequest(msgspec.Struct, frozen=True):
 
 
 class Issued(msgspec.Struct, frozen=True):
-    """A certificate in its file. replaced_until: when the one ends that it replaces."""
+    """A certificate in its file. replaced_until: when the certificate that it replaces expires."""
 
     common_name: str
     expires: datetime
@@ -83,7 +83,7 @@ class Issued(msgspec.Struct, frozen=True):
 
 
 class Revoked(msgspec.Struct, frozen=True):
-    """A name that is gone. until: when its certificate ends, if there is one. server: it is a server's too."""
+    """A revoked name. until: when its certificate expires, if any. server: its certificate is a server's too."""
 
     common_name: str
     until: datetime | None
@@ -91,7 +91,7 @@ class Revoked(msgspec.Struct, frozen=True):
 
 
 def init(folder: Folder, now: datetime, *, force: bool = False) -> Issued:
-    """Make an authority, and ``roles.toml`` where there is none. force: replace an authority."""
+    """Make an authority, and ``roles.toml`` if there is none. force: replace an authority."""
     make_folder(folder.path)
     with changing(folder):
         if not force:
@@ -128,7 +128,7 @@ def issue(folder: Folder, request: CertificateRequest, now: datetime, *, force: 
 
 
 def renew(folder: Folder, name: str, now: datetime, *, days: int = DAYS) -> Issued:
-    """Make a new certificate for the key that a name has, with its hosts, and the role in ``roles.toml``."""
+    """Make a new certificate for a name's existing key, with its hosts, and the role in ``roles.toml``."""
     with changing(folder):
         roles = load_roles(folder.roles)
         check_known(folder, roles, name)
@@ -142,7 +142,7 @@ def renew(folder: Folder, name: str, now: datetime, *, days: int = DAYS) -> Issu
 
 
 def revoke(folder: Folder, name: str) -> Revoked:
-    """Take a name out of ``roles.toml`` for good. Its files stay; a router that is restarted does not know them."""
+    """Remove a name from ``roles.toml`` for good. Its files stay; a restarted router does not know them."""
     with changing(folder):
         roles = load_roles(folder.roles)
         check_known(folder, roles, name)
@@ -198,7 +198,7 @@ def _write_certificate(folder: Folder, name: str, certificate: Certificate) -> N
 
 
 def _present(folder: Folder, name: str) -> Certificate | None:
-    """Return the certificate that a name has; None if there is none, or none that can be read."""
+    """Return the certificate of a name; None if there is none, or it cannot be read."""
     try:
         return x509.read_certificate(folder.of(name).certificate)
     except ConfigError:

@@ -1,4 +1,4 @@
-"""One name packed for another machine: its files, and a ``[bus]`` table that uses them; for a router, the roles."""
+"""Packs one name for another machine: its files, and a ``[bus]`` table that uses them; for a router, the roles."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from zbridge.security.roles import Roles, load_roles
 from zbridge.toml import as_toml
 
 PORT = 7447
-"""Where Zenoh routers listen."""
+"""The default port of Zenoh routers."""
 
 _ENDPOINT = re.compile(r"tls/[A-Za-z0-9_.-]+:[0-9]{1,5}")
 _EXAMPLE = f"tls/router.lab:{PORT}"
 
 
 class Packing(msgspec.Struct, frozen=True):
-    """Where a bundle goes. connect: Zenoh endpoints; none: those of the routers that the authority has issued.
+    """The destination of a bundle. connect: Zenoh endpoints; none: those of the routers that the authority has issued.
 
-    at: where the folder will stand on the other machine, if that is another path than ``folder``.
+    at: the folder's path on the other machine, if it differs from ``folder``.
     """
 
     folder: Path

@@ -1,4 +1,4 @@
-"""Keys and X.509 certificates as a secure bus needs them: made, and read back. The time is an argument.
+"""Makes and reads the keys and X.509 certificates of a secure bus. The time is an argument.
 
 ECDSA on P-256. A certificate is for clients; one with hosts, which a server needs, is for both. Zenoh 1.10 (rustls)
 demands that a router's certificate is for servers and names the host that clients connect to as a subject alternative
@@ -30,7 +30,7 @@ from zbridge.errors import ConfigError
 from zbridge.security.files import read, read_secret
 
 EARLIER = timedelta(hours=1)
-"""How long before now a certificate begins: the clock of another machine may be slow."""
+"""How long before its issue a certificate becomes valid: the clock of another machine may be slow."""
 
 _LABEL = r"[a-z0-9_]([a-z0-9_-]{0,61}[a-z0-9_])?"
 _HOST = re.compile(rf"(?=.{{1,253}}$){_LABEL}(\.{_LABEL})*")
@@ -49,7 +49,7 @@ def new_key() -> EllipticCurvePrivateKey:
 
 
 def new_authority(now: datetime, days: int) -> CertificateAuthority:
-    """Make an authority for ``days`` days. Its name is its own: programs tell one authority from another by it."""
+    """Make an authority for ``days`` days. Its name is unique: programs distinguish authorities by it."""
     key = new_key()
     number = x509.random_serial_number()
     name = _name(f"zbridge authority {number % 2**32:08x}")
@@ -66,7 +66,7 @@ def new_certificate(
     hosts: tuple[str, ...],
     lifetime: tuple[datetime, int],
 ) -> x509.Certificate:
-    """Sign a certificate for a key. lifetime: now, and the number of days. hosts: with any, it is a server's too."""
+    """Sign a certificate for a key. lifetime: now, and the number of days. hosts: for a server certificate."""
     builder = _builder(_name(common_name), authority.certificate.subject, key, lifetime, x509.random_serial_number())
     issuer = x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key())
     uses = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])]
@@ -82,7 +82,7 @@ def new_certificate(
 
 
 def check_host(text: str) -> str:
-    """Return a host as it stands in a certificate; raise ConfigError if it is neither a name nor an IP address."""
+    """Return a host in the form of a certificate; raise ConfigError if it is neither a name nor an IP address."""
     try:
         address = ipaddress.ip_address(text.removeprefix("[").removesuffix("]"))
     except ValueError:
@@ -96,7 +96,7 @@ def check_host(text: str) -> str:
 
 
 def is_reachable(host: str) -> bool:
-    """Tell whether Zenoh connects to a host by TLS. It takes ``tls/[::1]:7447`` for a name, and refuses it."""
+    """Return whether Zenoh can connect to a host by TLS. It treats ``tls/[::1]:7447`` as a name, and rejects it."""
     return ":" not in host
 
 
@@ -130,7 +130,7 @@ def key_pem(key: EllipticCurvePrivateKey) -> bytes:
 
 
 def common_name_of(certificate: x509.Certificate) -> str:
-    """Return the common name, which access rules go by; empty if there is none."""
+    """Return the common name, which access rules use; empty if there is none."""
     names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     return str(names[0].value) if names else ""
 
@@ -150,7 +150,7 @@ def fingerprint(certificate: x509.Certificate) -> str:
 
 
 def issued_by(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
-    """Tell whether an authority has signed a certificate."""
+    """Return whether an authority has signed a certificate."""
     try:
         certificate.verify_directly_issued_by(authority)
     except (InvalidSignature, ValueError, TypeError):

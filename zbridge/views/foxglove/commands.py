@@ -47,7 +47,7 @@ RULES = StickRules(
     idle_s=PAUSE_S,
     neutral_counts=True,
     quiet_s=QUIET_S,
-    advice="; let go for a second, then drive",
+    advice="; release the control for a second, then drive",
 )
 CMD_VEL, STOP, LATCH, UNLATCH = "cmd_vel", "stop", "latch", "unlatch"
 _TWISTS = ("geometry_msgs/Twist", "geometry_msgs/msg/Twist")

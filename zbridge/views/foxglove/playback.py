@@ -112,7 +112,7 @@ class IndexedRecording:
         return sorted(found.values(), key=lambda message: message.log_ns)
 
     def _read_index(self, file: IO[bytes]) -> bool:
-        """Read channels and times from the index; False where there is none."""
+        """Read channels and times from the index; False if there is none."""
         try:
             summary = SeekingReader(file, record_size_limit=RECORD_BYTES).get_summary()
         except Exception:  # whatever a damaged index makes the library raise: the messages may still be good

@@ -117,7 +117,7 @@ def service_response(call: ServiceCall, payload: bytes) -> bytes:
 
 
 def service_failure(call: ServiceCall, why: str) -> str:
-    """Say why a call was not carried out."""
+    """Return why a call was not carried out."""
     return text("serviceCallFailure", serviceId=call.service_id, callId=call.call_id, message=why)
 
 

@@ -167,7 +167,7 @@ class ViewerServer:
             for reason, count in viewer.counts.items():
                 self._metrics.count("foxglove_viewer_messages", what=reason).value += count
             counted = ", ".join(f"{reason} {count}" for reason, count in sorted(viewer.counts.items()) if count)
-            log.info("%s %s (%s)", name, why, counted or "said nothing")
+            log.info("%s %s (%s)", name, why, counted or "sent nothing")
 
 
 class _Guarded(ServerConnection):

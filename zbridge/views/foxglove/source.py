@@ -31,7 +31,7 @@ class ViewerCommands:
 
     async def call(self, viewer: Subscriber, service_id: int, payload: bytes) -> bytes:
         """Carry out a service's call; return its answer in JSON."""
-        raise Unsupported("there are no services")
+        raise Unsupported("no services here")
 
     async def set_parameter(self, viewer: Subscriber, name: str, value: Any) -> None:
         """Change a parameter."""
@@ -74,4 +74,4 @@ class ViewerSource:
 
     def play(self, viewer: Subscriber, request: PlaybackRequest) -> None:
         """Play, pause or seek in a recording; raise Refused."""
-        raise Unsupported("this is no recording")
+        raise Unsupported("not a recording")

@@ -1,7 +1,7 @@
 """One viewer: reads its messages, asks the source to carry them out, and sends what waits for it.
 
 A message that cannot be read or carried out is counted, and the person is told why; it ends nothing. A viewer that
-sends more than ``RATE_HZ`` a second, or lets answers wait, is closed. Knows no bus and no file.
+sends more than ``RATE_HZ`` a second, or lets too many answers queue up, is closed. Knows no bus and no file.
 """
 
 from __future__ import annotations
@@ -164,7 +164,7 @@ class Viewer:
             except Refused as refused:
                 self.refuse(refused)
             if self._outbox.overrun:
-                raise Overrun("lets answers wait")
+                raise Overrun("too many queued answers")
 
     def refuse(self, why: Exception) -> None:
         """Count what was not carried out, and tell the person."""

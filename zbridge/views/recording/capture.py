@@ -132,7 +132,7 @@ class BusCapture:
             await asyncio.sleep(SESSIONS_S)
 
     async def _query(self, key_expr: str, wanted: Callable[[str], bool]) -> bool:
-        """Record the answers of a query; False where nobody answered."""
+        """Record the answers of a query; False if nobody answered."""
         answers = []
         with contextlib.suppress(BusError):
             answers = [answer for answer in await self._bus.ask(key_expr) if answer.error is None]
@@ -148,7 +148,7 @@ TEXT_BYTES = 4096
 
 
 async def publish_mark(bus: Bus, realm: str, text: str, who: str) -> None:
-    """Put a mark; raise ConfigError where the text is empty or too long, BusError where the bus is stalled."""
+    """Put a mark; raise ConfigError if the text is empty or too long, BusError if the bus is stalled."""
     if not text.strip() or len(text.encode()) > TEXT_BYTES:
         raise ConfigError(f"TEXT: expected 1 to {TEXT_BYTES} bytes")
     mark = Text(text=text, kind="chat", sender=who, stamp_ns=time.time_ns())

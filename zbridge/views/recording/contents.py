@@ -77,7 +77,7 @@ def message_of(key: str) -> type[FleetMessage] | None:
 
 
 def is_wire(key: str) -> bool:
-    """Tell whether raw legacy frames travel on a key."""
+    """Return whether raw legacy frames travel on a key."""
     return "/@wire/" in key
 
 
@@ -96,7 +96,7 @@ def schema_of(message: type[FleetMessage]) -> Schema:
 
 
 def read_sender(attachment: bytes | None) -> bytes | None:
-    """Read which lease an attachment claims; None where it claims none."""
+    """Read which lease an attachment claims; None if it claims none."""
     if not attachment:
         return None
     try:

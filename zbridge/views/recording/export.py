@@ -76,7 +76,7 @@ def export_tables(path: Path, folder: Path, selection: Selection) -> Export:
 
 
 def export_arrays(path: Path, output: Path, selection: Selection) -> Export:
-    """Write scans and poses to one ``.npz``; raise ConfigError where they exceed ARRAY_BYTES, OSError.
+    """Write scans and poses to one ``.npz``; raise ConfigError if they exceed ARRAY_BYTES, OSError.
 
     Arrays: ``<robot>/pose/x``, ``y``, ``heading``; ``<robot>/scan/ranges`` float32[scans, points] filled with NaN,
     ``angle_min``, ``angle_increment``; each with ``log_ns`` and ``stamp_ns`` (int64, the publish time).

@@ -55,7 +55,7 @@ class Intake:
         return f"<Intake {len(self._waiting)} waiting, {self.dropped.total()} dropped>"
 
     def put(self, key: str, payload: bytes, attachment: bytes | None = None) -> bool:
-        """Queue a message, from any thread; False where it was dropped. Arrival times rise along the queue."""
+        """Queue a message, from any thread; False if it was dropped. Arrival times rise along the queue."""
         size = len(payload) + (len(attachment) if attachment is not None else 0)
         return self.put_sized(key, size, lambda: payload, attachment)
 

@@ -171,7 +171,7 @@ class Player:
         return None if reader.ended else reader.fault
 
     def _wait(self, log_ns: int) -> bool:
-        """Sleep until a moment is due; False where the player ends."""
+        """Sleep until a moment is due; False if the player ends."""
         while not self._closing:
             with self._lock:
                 wait_s = math.inf if self.paused else self._time.wait_s(log_ns, self._clock())

@@ -94,7 +94,7 @@ class RecordingReader:
         """Yield the messages up to the end of the file, or to what cannot be read. Raises OSError."""
         try:
             if self._file.read(len(MAGIC)) != MAGIC:
-                raise BrokenError("this is no MCAP file")
+                raise BrokenError("not an MCAP file")
             yield from self._records()
         except BrokenError as error:
             self.fault = str(error)
@@ -220,7 +220,7 @@ _RECORDS: dict[int, Callable[[RecordingReader, Fields], None]] = {
 
 
 def _decompressed(content: bytes) -> bytes:
-    """Return the records of a chunk; raise BrokenError where its size or checksum is not as stated."""
+    """Return the records of a chunk; raise BrokenError if its size or checksum is not as stated."""
     fields = Fields(memoryview(content))
     _, _, size, checksum = _CHUNK.unpack(fields.octets(_CHUNK.size))
     compression = fields.text()
@@ -264,7 +264,7 @@ _DECOMPRESS: dict[str, Callable[[bytes, int], bytes]] = {"": lambda packed, size
 
 
 def open_recording(path: Path) -> IO[bytes]:
-    """Open a file for a reader; raise ConfigError where that is not possible."""
+    """Open a file for a reader; raise ConfigError if that is not possible."""
     try:
         return path.open("rb", buffering=2**20)
     except OSError as error:

@@ -100,7 +100,7 @@ class Recorder:
         return f"<Recorder {self._tape!r}, {self.messages} messages>"
 
     def start(self) -> None:
-        """Begin the first file; raise ZbridgeError where that is not possible."""
+        """Begin the first file; raise ZbridgeError if that is not possible."""
         try:
             self._tape.begin(time.monotonic(), self._metadata)
         except FileExistsError as error:

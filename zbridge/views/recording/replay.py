@@ -64,7 +64,7 @@ class Survey(msgspec.Struct, frozen=True):
 
 
 def survey(path: Path) -> Survey:
-    """ReadPayload through the begin of a recording; raise ConfigError where there is no robot."""
+    """Read the beginning of a recording; raise ConfigError if there is no robot."""
     keys: set[str] = set()
     statuses: dict[str, Status] = {}
     with open_recording(path) as file:
@@ -154,7 +154,7 @@ class Replay:
         return f"<Replay {self.player!r}>"
 
     async def run(self) -> None:
-        """Replay until the end of the file; raise ZbridgeError where a name is alive, or is taken by a gateway."""
+        """Replay until the end of the file; raise ZbridgeError if a name is alive, or is taken by a gateway."""
         async with contextlib.AsyncExitStack() as stack:
             watching = []
             for recorded, name in self._plan.names.items():

@@ -73,7 +73,7 @@ def read_moment(name: str, text: str, begin_ns: int) -> int:
 
 
 def read_selection(begin_ns: int, since: str, until: str, key_expr: str | None = None) -> Selection:
-    """Read ``--from`` and ``--to``, empty where they were not given; raise ConfigError. begin_ns: of the recording."""
+    """Read ``--from`` and ``--to``, empty if they were not given; raise ConfigError. begin_ns: of the recording."""
     return Selection(
         key_expr,
         read_moment("from", since, begin_ns) if since else 0,

@@ -57,7 +57,7 @@ class KeySummary(msgspec.Struct):
 
 
 class Summary(msgspec.Struct):
-    """A whole recording. fault: what is wrong with the file, None where it ends properly."""
+    """A whole recording. fault: what is wrong with the file, None if it ends properly."""
 
     path: str
     size: int
@@ -84,7 +84,7 @@ def robots_of(topics: Iterable[str]) -> list[str]:
 
 
 def summarize(path: Path) -> Summary:
-    """Count what a file holds; raise ConfigError where it cannot be opened or is no recording at all."""
+    """Count what a file holds; raise ConfigError if it cannot be opened or is no recording at all."""
     with open_recording(path) as file:
         reader = RecordingReader(file)
         keys: dict[RecordedChannel, KeySummary] = {}

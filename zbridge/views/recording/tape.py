@@ -158,7 +158,7 @@ class Tape:
         self._writer.add_metadata(name, dict(pairs))
 
     def register(self, kind: ChannelKind) -> int | None:
-        """Add a channel to the current file; return its id, None where there are too many."""
+        """Add a channel to the current file; return its id, None if there are too many."""
         if self._channels >= CHANNELS:
             return None
         self._channels += 1
@@ -188,7 +188,7 @@ class Tape:
             self._flush_file(now)
 
     def full(self, now: float) -> bool:
-        """Tell whether another file has to begin."""
+        """Return whether another file has to begin."""
         settings, file = self._settings, self._file
         if file is None:
             return False
@@ -209,7 +209,7 @@ class Tape:
         self._release()
 
     def salvage(self) -> bool:
-        """End the current file with what of it is on the disk; False where it could not be ended properly."""
+        """End the current file with what of it is on the disk; False if it could not be ended properly."""
         file = self._file
         if file is None:
             return True
@@ -252,7 +252,7 @@ class Tape:
 
 
 def make_writer(stream: Any, compression: Compression) -> Any:
-    """Make the library's writer; raise ConfigError where it is not installed."""
+    """Make the library's writer; raise ConfigError if it is not installed."""
     try:
         from mcap.writer import CompressionType, Writer
     except ImportError as error:

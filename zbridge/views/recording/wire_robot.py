@@ -64,7 +64,7 @@ class WireLink(asyncio.DatagramProtocol):
         return f"<WireLink {self.link}, {self.frames} frames>"
 
     async def run(self, address: Address, ready: Callable[[Address], object]) -> None:
-        """Listen, and play all conversations. Raises LinkError where the address cannot be had."""
+        """Listen, and play all conversations. Raises LinkError if the address cannot be had."""
         try:
             server = await asyncio.start_server(self._connected, address.host, address.port)
         except OSError as error:
@@ -110,7 +110,7 @@ class WireLink(asyncio.DatagramProtocol):
                     self.frames += 1
                 await asyncio.sleep(LINGER_S)
             if reader.fault is not None:
-                self._report(f"{self.link}: the recording is not whole: {reader.fault}")
+                self._report(f"{self.link}: the recording is incomplete: {reader.fault}")
 
     @contextlib.asynccontextmanager
     async def _conversation(self) -> AsyncIterator[asyncio.StreamWriter]:
@@ -140,7 +140,7 @@ class WireLink(asyncio.DatagramProtocol):
         self._news.set()
 
     async def _wait_received(self, size: int) -> bool:
-        """Wait until the gateway has sent so many bytes; False where it did not in time."""
+        """Wait until the gateway has sent so many bytes; False if it did not in time."""
         try:
             async with asyncio.timeout(ANSWER_S):
                 while self._received < size:

@@ -34,7 +34,7 @@ def entries_of(robot: str, status: Status | None, control: Control | None) -> li
 def _state(robot: str, status: Status | None) -> Diagnostic:
     name = f"{robot}: state"
     if status is None:
-        return Diagnostic(STALE, name, "no gateway tells")
+        return Diagnostic(STALE, name, "no gateway reports")
     facts = (("protocol", status.protocol), ("dialect", status.dialect), ("version", status.version))
     values = [(key, value) for key, value in facts if value]
     if status.features:
@@ -54,7 +54,7 @@ def _links(robot: str, status: Status | None) -> Diagnostic:
 def _control(robot: str, control: Control | None) -> Diagnostic:
     name = f"{robot}: control"
     if control is None:
-        return Diagnostic(STALE, name, "no gateway tells")
+        return Diagnostic(STALE, name, "no gateway reports")
     values = [("holder", cut(control.holder))] if control.holder else []
     values += [(f"latch {latch.id.hex()[:8]}", cut(latch.described)) for latch in control.latches]
     text = f"held by {control.holder}" if control.holder else control.state

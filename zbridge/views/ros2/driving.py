@@ -31,7 +31,7 @@ RULES = StickRules(
     lapsed=f"silent for {DEADMAN_S:g} s while it drove",
     advice=": send a zero, or nothing for a second, then drive",
 )
-_EARLY = "it was there before"
+_EARLY = "it existed before"
 
 
 class TwistPublisher(msgspec.Struct, frozen=True, eq=False):
@@ -60,7 +60,7 @@ class Driving:
         return self._driver if self._driver is not None and self._driver.stick.active else None
 
     def came(self, gid: bytes, name: str, now: float, *, early: bool) -> bool:
-        """A publisher's token came; False where there is no place. early: the publisher was there before us."""
+        """A publisher's token came; False if there is no place. early: the publisher was there before us."""
         known = self.publishers.get(gid)
         if known is not None:
             if early and not known.stick.active and known.stick.needs_neutral is None:

@@ -49,7 +49,7 @@ class Reckoning:
         return f"<Reckoning {self.pose.x:.2f} {self.pose.y:.2f} {self.pose.heading:.2f}>"
 
     def add(self, speeds: Speeds, stamp_ns: int) -> Pose | None:
-        """Add a motion that was measured at ``stamp_ns``; None where it has no speed or no turn rate."""
+        """Add a motion that was measured at ``stamp_ns``; None if it has no speed or no turn rate."""
         if speeds.forward_mps is None or speeds.turn_radps is None:
             return None
         before, self._at_ns = self._at_ns, stamp_ns

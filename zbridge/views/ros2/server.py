@@ -46,11 +46,11 @@ async def serve(plan: Ros2Plan, bus: BusSettings, metrics: Metrics, on_ready: Ca
 
 
 def require_two_routers(fleet: Bus, ros: Bus, plan: Ros2Plan) -> None:
-    """Raise ConfigError where both sessions are at one router: a fleet's rules do not know ROS's keys."""
+    """Raise ConfigError if both sessions are at one router: a fleet's rules do not know ROS's keys."""
     if set(fleet.routers()) & set(ros.routers()) or fleet.zid in ros.routers():
         where = ", ".join(plan.router.connect)
         raise ConfigError(
-            f"ros = {where}: the same router as the fleet's. Both like port 7447: give one of them another port, "
+            f"ros = {where}: the same router as the fleet's. Both default to port 7447: give one another port, "
             "and say where with --ros or --connect"
         )
 
@@ -84,7 +84,7 @@ class View:
 
     def _on_connected(self, up: bool) -> None:
         if not up:
-            log.warning("ROS's router is gone: whoever drove is stopped")
+            log.warning("ROS's router is gone: robots driven from ROS are stopped")
         for node in self.nodes.values():
             if node.teleop is not None:
                 node.teleop.connected(up)

@@ -1,6 +1,6 @@
 """Fleet messages as ROS messages: units and axes after REP 103, frames after REP 105, NaN in scans after REP 117.
 
-Sans-IO. A pose is the robot's own, in its map: ``map`` and ``odom`` are the same here. A function returns None where a
+Sans-IO. A pose is the robot's own, in its map: ``map`` and ``odom`` are the same here. A function returns None if a
 message has no sense as a ROS message: numbers that are not finite, a scan or map without content. Messages that come
 often are bytes that are filled in: rosbags takes several times as long.
 """
@@ -68,7 +68,7 @@ class Frames:
 
 
 class Speeds(msgspec.Struct, frozen=True):
-    """How a robot moves: m/s, rad/s; None where nobody measured it. full_mps: its full scale."""
+    """How a robot moves: m/s, rad/s; None if nobody measured it. full_mps: its full scale."""
 
     forward_mps: float | None
     turn_radps: float | None

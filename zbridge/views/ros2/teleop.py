@@ -127,7 +127,7 @@ class Teleop:
                 self._forget(token)
 
     def _on_token(self, token: str, alive: bool, *, late: bool = False) -> None:
-        """Enter a publisher, or forget it. late: it was there before, and we did not know."""
+        """Enter a publisher, or forget it. late: it existed before, and we did not know."""
         if not alive and self._asking is not None:
             self._left.add(token)
         endpoint = read_token(token)

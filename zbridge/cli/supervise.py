@@ -25,7 +25,7 @@ def supervise(paths: tuple[Path, ...], *, watch: bool, verbose: bool) -> None:
 
 
 def resume(descriptor: int) -> None:
-    """Go on as a supervisor, in place of the code that left the state behind a descriptor; raise HandoverError."""
+    """Continue as a supervisor, in place of the code that left the state behind a descriptor; raise HandoverError."""
     set_up_log(verbose=False)
     state = restore(descriptor)
     os.close(descriptor)

@@ -175,9 +175,9 @@ class ForkClient:
         """The fork server, for :meth:`resume`."""
         return self._server.state if self._server is not None and self._server.alive else None
 
-    def resume(self, server: ServerState) -> None:
+    def resume(self, server: ServerState | None) -> None:
         """Resume the fork server that the code before this one has started."""
-        self._server = _Server(server)
+        self._server = _Server(server) if server is not None else None
 
     async def fork(
         self,

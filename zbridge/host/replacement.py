@@ -40,10 +40,7 @@ TURNS = 10
 
 
 class ProcessState(msgspec.Struct, frozen=True):
-    """A running gateway process. channel: a descriptor. began: when it was forked.
-
-    reports: messages and their descriptors: what the process reported, as far as it still counts.
-    """
+    """A running gateway process. channel: a descriptor. reports: its messages that still count, with descriptors."""
 
     pid: int
     channel: int
@@ -53,10 +50,7 @@ class ProcessState(msgspec.Struct, frozen=True):
 
 
 class RunnerState(msgspec.Struct, frozen=True):
-    """One robot: the file as it runs, and its process. next_at: when the next one starts, if none runs.
-
-    forms, shares: of the robot's addresses.
-    """
+    """One robot: its file as it runs, and its process. next_at: when the next process starts, if none runs."""
 
     path: str
     content: bytes

@@ -180,8 +180,7 @@ class Supervisor:
 
     def _resume(self, at: float) -> None:
         """Resume where the code before this one was at this time."""
-        if self._state.server is not None:
-            self._forks.resume(self._state.server)
+        self._forks.resume(self._state.server)
         self.runners.check_at = at  # this process has checked no watchdog since
         self.runners.resume(self._state.runners)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)

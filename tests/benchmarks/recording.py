@@ -111,7 +111,7 @@ def replayed(path: Path) -> Callable[[Callable[[], None]], None]:
 
     def play(put: Callable[[], None]) -> None:
         ended = threading.Event()
-        Player(path, Selection(), lambda message: put(), lambda fault: ended.set()).start()
+        Player(path, Selection(), lambda message, selected: put(), lambda fault: ended.set()).start()
         ended.wait()
 
     return play

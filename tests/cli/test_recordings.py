@@ -21,8 +21,8 @@ from zbridge.fleet import topics
 
 NOWHERE = BusSettings(connect=("tcp/127.0.0.1:1",), multicast=False)
 RECORD: dict[str, Any] = {
-    "robots": (), "keys": None, "only": None, "wire": False, "split": None, "keep": None, "duration": None,
-    "compression": "zstd", "configs": (), "buffer": "64MiB", "realm": "fleet",
+    "robots": (), "keys": "", "only": "", "wire": False, "split": "", "keep": 0, "duration": "",
+    "compression": "zstd", "config": (), "buffer": "64MiB", "realm": "fleet",
 }  # fmt: skip
 REPLAY: dict[str, Any] = {
     "realm": "fleet", "robots": (), "speed": 1.0, "loop": False, "since": "", "until": "", "pause": False, "hq": (),
@@ -37,7 +37,7 @@ REFUSED = [
     ({"realm": "a/b"}, "realm = 'a/b'"),
     ({"keys": "fleet/r1/pose*"}, r"keys = 'fleet/r1/pose\*': `\*` may only be preceded by"),
     ({"keys": "/fleet/**"}, r"keys = '/fleet/\*\*': .*: try 'fleet/\*\*'"),
-    ({"configs": (Path("/none.toml"),)}, "none.toml"),
+    ({"config": (Path("/none.toml"),)}, "none.toml"),
 ]
 
 
@@ -66,7 +66,7 @@ async def test_a_file_that_exists_is_not_written_over(tmp_path: Path) -> None:
 async def test_a_replay_with_a_wrong_option_is_refused(tmp_path: Path, given: dict[str, Any], why: str) -> None:
     path = files.written(tmp_path / "a.mcap", [(f"fleet/{robot}/pose", 0.0, b"\x80") for robot in ("r1", "r2")])
     with pytest.raises(ConfigError, match=why):
-        await run_replay(NOWHERE, ReplayOptions(path=path, **{**REPLAY, **given}))
+        await run_replay(NOWHERE, ReplayOptions(file=path, **{**REPLAY, **given}))
 
 
 @pytest.mark.parametrize(
@@ -124,7 +124,7 @@ async def test_a_replay_counts_what_it_plays_and_what_it_leaves_out(
         yield FakeBus()
 
     monkeypatch.setattr("zbridge.cli.recording.joined", joined)
-    await run_replay(NOWHERE, ReplayOptions(path=path, **{**REPLAY, "robots": ("r1=again",), "speed": 1000.0}))
+    await run_replay(NOWHERE, ReplayOptions(file=path, **{**REPLAY, "robots": ("r1=again",), "speed": 1000.0}))
     assert capsys.readouterr().err.splitlines() == [
         "r1 as again",
         "2 messages played, 3 left out (other robots, commands, queries, raw frames, pictures)",

@@ -10,8 +10,9 @@ import pytest
 
 from zbridge.errors import NotReady
 from zbridge.host import fork_client as module
-from zbridge.host.fd_channel import FdChannel, Fork
-from zbridge.host.fork_client import ForkClient, Installation, fork_server_command
+from zbridge.host.fd_channel import FdChannel, Fork, in_memory
+from zbridge.host.fork_client import ForkClient, fork_server_command, installed
+from zbridge.host.replacement import SupervisorState, encode
 from zbridge.host.supervisor import become_reaper
 
 SOON_S = 30.0
@@ -91,6 +92,14 @@ async def test_without_a_free_descriptor_no_gateway_is_forked_and_the_reason_is_
             await forked(made, tmp_path / "r1.toml")
 
 
+async def test_a_fork_server_says_whether_its_code_takes_the_state_of_a_supervisor() -> None:
+    async with forks() as made:
+        with in_memory("state", encode(SupervisorState(("robots",), at=1.0))) as state:
+            await made.rehearse(state)
+        with in_memory("state", b"\0") as state, pytest.raises(NotReady, match="no state of a supervisor"):
+            await made.rehearse(state)
+
+
 async def test_a_fork_server_whose_code_is_broken_is_reported(caplog: pytest.LogCaptureFixture) -> None:
     async with forks(["false"]) as made:
         with pytest.raises(NotReady, match="did not start"):
@@ -100,29 +109,15 @@ async def test_a_fork_server_whose_code_is_broken_is_reported(caplog: pytest.Log
             await made.renew()
 
 
-class PlayedStamp:
-    """An installation that the test changes."""
-
-    number, settled = 1, True
-
-    def __init__(self) -> None:
-        self.mine, self.settled = PlayedStamp.number, PlayedStamp.settled
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, PlayedStamp) and self.mine == other.mine
-
-    __hash__ = None  # type: ignore[assignment]
-
-
 async def test_a_changed_installation_gets_a_server_of_its_own_and_a_broken_one_does_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(module, "Installation", PlayedStamp)
+    stamps = [(b"one", True)]
+    monkeypatch.setattr(module, "installed", lambda: stamps[-1])
     become_reaper()
 
     def changes(*, settled: bool = True) -> None:
-        monkeypatch.setattr(PlayedStamp, "number", PlayedStamp.number + 1)
-        monkeypatch.setattr(PlayedStamp, "settled", settled)
+        stamps.append((b"%d" % len(stamps), settled))
 
     async def server(prepare: Callable[[], object] = lambda: None) -> int | None:
         prepare()
@@ -149,9 +144,9 @@ def test_the_stamp_of_an_installation_changes_with_its_code(tmp_path: Path, monk
     source = tmp_path / "code.py"
     source.write_text("a = 1\n")
     os.utime(source, (1e9, 1e9))
-    before = Installation()
-    assert before == Installation()
+    before, _ = installed()
+    assert before == installed()[0]
     source.write_text("a = 22\n")
-    after = Installation()
+    after, settled = installed()
     assert after != before
-    assert not after.settled
+    assert not settled

@@ -5,23 +5,23 @@ import contextlib
 import os
 import signal
 import socket
-import sys
 import threading
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
 
-from zbridge.errors import HandoverError
-from zbridge.host import replacement
+from zbridge.errors import HandoverError, NotReady
+from zbridge.host import fork_server, replacement
 from zbridge.host import supervisor as module
 from zbridge.host.deposit import Deposit
-from zbridge.host.fd_channel import Deposited, FdChannel, Heartbeat, Opened, Shared
+from zbridge.host.fd_channel import Deposited, FdChannel, Forked, Heartbeat, Opened, Rehearse, Shared, in_memory
 from zbridge.host.files import Changes, Follower, RobotFile
 from zbridge.host.fork_client import ForkClient
+from zbridge.host.fork_server import serve
 from zbridge.host.memory import MemoryWriter
 from zbridge.host.process import GatewayProcess
 from zbridge.host.replacement import (
@@ -31,12 +31,11 @@ from zbridge.host.replacement import (
     RunnerState,
     ServerState,
     SupervisorState,
+    encode,
     replace,
     restore,
-    store,
 )
 from zbridge.host.runner import Runner
-from zbridge.host.settings import HostSettings
 from zbridge.host.supervisor import Supervisor
 from zbridge.host.watchdog import DRIVEN_S, Watchdog
 from zbridge.robot.observer import Boundary, LastStop, StopFrame
@@ -49,53 +48,47 @@ NOBODY = 2**22 + 1
 
 
 def empty(**fields: object) -> SupervisorState:
-    return msgspec.structs.replace(SupervisorState(VERSION, ("robots",), at=1.0, check_at=2.0), **fields)
+    return msgspec.structs.replace(SupervisorState(("robots",), at=1.0), **fields)
 
 
-@contextlib.contextmanager
-def stored(state: SupervisorState) -> Iterator[int]:
-    descriptor = store(state)
-    try:
-        yield descriptor
-    finally:
-        os.close(descriptor)
+def stored(state: SupervisorState) -> contextlib.AbstractContextManager[int]:
+    return in_memory("state", encode(state))
 
 
 def test_a_state_is_read_as_it_was_written_as_often_as_wanted() -> None:
-    process = ProcessState(7, 8, 1.5, Watchdog(2.0, DRIVEN_S, 0.1, 3), LAST, 9, True, Deposited(((1, 0),), 1, 5), ())
+    reports = (
+        (Shared(), (9,)),
+        (Opened(1, "r1"), (14, 15)),
+        (Deposited(((1, 0),), 1, 5), ()),
+        (Heartbeat(LAST, {1: Boundary()}, hands_over=True), ()),
+    )
+    process = ProcessState(7, 8, 1.5, Watchdog(2.0, DRIVEN_S, 0.1, 3), reports)
     robots = (
-        RunnerState("robots/r1.toml", b"\xff", ("fleet", "r1"), 2, 1, None, process),
-        RunnerState("robots/r2.toml", b"", None, 0, 6, 61.5),
+        RunnerState(
+            "robots/r1.toml", b"\xff", ("fleet", "r1"), frozenset({"tcp 127.0.0.1 1"}), True, 2, 1, None, process
+        ),
+        RunnerState("robots/r2.toml", b"", None, failures=6, next_at=61.5),
     )
     faults = {"robots/r2.toml": "colour"}
-    state = empty(runners=robots, server=ServerState(11, 12, b"\0stamp"), leaving=(13,), faults=faults, watch=True)
+    state = empty(runners=robots, server=ServerState(11, 12, b"\0stamp"), faults=faults, watch=True)
     with stored(state) as descriptor:
         assert [restore(descriptor), restore(descriptor)] == [state, state]
-    assert set(state.descriptors) == {8, 9, 12}
-
-
-def test_a_state_of_another_version_is_refused_whatever_else_it_has() -> None:
-    other = msgspec.msgpack.encode({"version": VERSION + 1, "sources": 5})
-    descriptor = os.memfd_create("state")
-    try:
-        os.write(descriptor, other)
-        with pytest.raises(HandoverError, match=f"version {VERSION + 1}, this code accepts version {VERSION}"):
-            restore(descriptor)
-    finally:
-        os.close(descriptor)
+    assert set(state.descriptors) == {8, 9, 12, 14, 15}
 
 
 @pytest.mark.parametrize(
-    "data", [b"\xc1", b"\x82\xa7version" + bytes([VERSION]) + b"\xa7sources\x91\xa1\xff"], ids=["form", "text"]
+    ("data", "reason"),
+    [
+        (msgspec.msgpack.encode({"version": VERSION + 1, "sources": 5}), f"of version {VERSION}: Invalid value"),
+        (b"\xc1", "no state of a supervisor"),
+        (msgspec.msgpack.encode(empty()).replace(b"robots", b"robot\xff"), "no state of a supervisor"),
+        (b"", "no state of a supervisor"),
+    ],
+    ids=["version", "form", "text", "nothing"],
 )
-def test_what_is_no_state_is_told_as_such(data: bytes) -> None:
-    descriptor = os.memfd_create("state")
-    try:
-        os.write(descriptor, data)
-        with pytest.raises(HandoverError, match="no state of a supervisor"):
-            restore(descriptor)
-    finally:
-        os.close(descriptor)
+def test_what_is_no_state_of_this_version_is_refused_and_told_as_such(data: bytes, reason: str) -> None:
+    with in_memory("state", data) as descriptor, pytest.raises(HandoverError, match=reason):
+        restore(descriptor)
 
 
 def test_no_state_is_said_in_one_line() -> None:
@@ -106,15 +99,6 @@ def test_no_state_is_said_in_one_line() -> None:
             restore(reading)
     finally:
         os.close(reading)
-
-
-def test_the_fields_of_a_state_keep_the_names_that_other_versions_read() -> None:
-    process = ProcessState(7, 8, 1.5, Watchdog(2.0, DRIVEN_S, 0.1, 3), LAST, 9, True, Deposited())
-    state = SupervisorState(VERSION, (), 100.0, 101.0, server=ServerState(5, 6, b"stamp"))
-    written = msgspec.to_builtins(process)
-    assert (written["post"], written["page"], written["kept"]["area"]) == (8, 9, -1)
-    assert written["heart"] == {"last": 2.0, "patience_s": DRIVEN_S, "excused_s": 0.1, "beats": 3}
-    assert (msgspec.to_builtins(state)["look_at"], msgspec.to_builtins(state)["server"]["post"]) == (101.0, 6)
 
 
 def test_a_watchdog_resumes_with_what_it_knew() -> None:
@@ -147,19 +131,13 @@ async def test_a_process_is_known_as_before_with_its_page_its_kept_state_and_the
     before.receive()
     asyncio.get_running_loop().remove_reader(near.fileno())
     state = msgspec.msgpack.decode(msgspec.msgpack.encode(before.state), type=ProcessState)
-    after = resumed_process(
-        msgspec.structs.replace(
-            state,
-            channel=os.dup(state.channel),
-            memory=os.dup(state.memory or 0),
-            links=tuple(msgspec.structs.replace(link, stream=os.dup(link.stream or 0)) for link in state.links),
-        )
-    )
+    reports = tuple((message, tuple(map(os.dup, descriptors))) for message, descriptors in state.reports)
+    after = resumed_process(msgspec.structs.replace(state, channel=os.dup(state.channel), reports=reports))
     before.close()
     ours.close()
     assert (after.last, after.hands_over) == (LAST, True)
     assert after.watchdog == before.watchdog
-    assert after.deposit.duplicates.state[0].boundary == Boundary(outgoing=False)
+    assert [each.boundary for each in after.deposit.duplicates] == [Boundary(outgoing=False)]
     kept, shared = after.deposit.deposited, after.deposit.memory
     assert kept is not None
     assert shared is not None
@@ -190,8 +168,8 @@ async def running() -> AsyncIterator[tuple[Runner, asyncio.Task[None], FdChannel
     """A runner that was resumed with a process, and the process's end of the channel."""
     near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     made, end = runner(), FdChannel(far)
-    process = ProcessState(NOBODY, near.detach(), 0.0, Watchdog(0.0, 1.0), LAST)
-    made.resume(RunnerState("r1.toml", b"", ("fleet", "r1"), 4, 2, process=process))
+    process = ProcessState(NOBODY, near.detach(), 0.0, Watchdog(0.0, 1.0))
+    made.resume(RunnerState("r1.toml", b"", ("fleet", "r1"), restarts=4, failures=2, process=process))
     task = asyncio.ensure_future(made.run())
     await asyncio.sleep(0)
     yield made, task, end
@@ -219,20 +197,17 @@ async def test_a_runner_with_something_under_way_is_not_calm(
 ) -> None:
     made, _, _ = running
     assert made.process is not None
-    restarting: asyncio.Future[None] | None = None
     match what:
         case "killed":
             made.process.kill("hung")
         case "restarting":
-            restarting = asyncio.ensure_future(made.restart(FILE))
+            made.restart(FILE)
             await asyncio.sleep(0)
         case "given":
             made.process.deposit.predecessor = Deposit()
         case _:
             setattr(made.process, what, True)
     assert not made.is_idle
-    if restarting is not None:
-        restarting.cancel()
 
 
 async def test_a_resumed_runner_waits_for_its_next_process_until_the_same_time() -> None:
@@ -248,44 +223,67 @@ async def test_a_resumed_runner_waits_for_its_next_process_until_the_same_time()
 
 # The replacement
 
-READS = "import sys; from zbridge.host.replacement import restore; restore(int(sys.argv[-1]))"
+
+async def agree(state: int) -> None:
+    """Read a state, as the installed code does that takes it."""
+    restore(state)
 
 
-def python(code: str) -> list[str]:
-    return [sys.executable, "-c", code]
+async def refuse(state: int) -> None:
+    raise NotReady("broken")
 
 
-@pytest.mark.parametrize(
-    ("code", "reason"),
-    [
-        ("import sys; sys.exit('broken: it is')", "the installed code does not start: broken: it is"),
-        ("import sys; sys.exit(3)", "the installed code does not start: exit code 3"),
-        ("import time; time.sleep(60)", "the installed code did not start within 0.2 s"),
-    ],
-)
-async def test_code_that_does_not_start_replaces_nothing(
-    monkeypatch: pytest.MonkeyPatch, code: str, reason: str
-) -> None:
+async def test_code_that_does_not_take_the_state_replaces_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(replacement, "_execute", lambda *_: pytest.fail("executed"))
-    if "sleep" in code:
-        monkeypatch.setattr(replacement, "REHEARSAL_S", 0.2)
-    with pytest.raises(HandoverError, match=reason):
-        await replace(python(code), empty)
+    with pytest.raises(NotReady, match="broken"):
+        await replace([], empty, refuse)
 
 
 async def test_a_command_that_is_not_there_replaces_nothing() -> None:
-    with pytest.raises(HandoverError, match="No such file"):
-        await replace(["/no/such/program"], empty)
+    with pytest.raises(FileNotFoundError):
+        await replace(["/no/such/program"], empty, agree)
+
+
+@pytest.mark.parametrize(
+    ("error", "answer"),
+    [(None, ""), (HandoverError("a state"), "a state"), (KeyError(1), "KeyError: 1 in")],
+)
+def test_a_fork_server_reads_the_state_in_place_of_the_supervisor_and_answers(
+    monkeypatch: pytest.MonkeyPatch, error: Exception | None, answer: str
+) -> None:
+    near, far = FdChannel.pair()
+    read: list[SupervisorState] = []
+
+    def read_state(state: int) -> None:
+        read.append(restore(state))
+        if error is not None:
+            raise error
+
+    monkeypatch.setattr(fork_server, "restore", read_state)
+    monkeypatch.setattr(fork_server, "_import_all", lambda: None)
+    monkeypatch.setattr(fork_server.signal, "signal", lambda *_: None)
+    with stored(empty()) as descriptor:
+        near.send(Rehearse(), [descriptor])
+    far.shutdown(socket.SHUT_RD)  # the end, after the request
+    serve(FdChannel(far), lambda _: pytest.fail("forked"))
+    assert read == [empty()]
+    near.receive()
+    received = near.receive()
+    assert received is not None
+    forked = received[0]
+    assert isinstance(forked, Forked)
+    expected = f"the installed code does not start: {answer}" if answer else ""
+    assert (forked.pid, (forked.reason or "")[: len(expected)]) == (0 if answer else os.getpid(), expected)
+    near.close()
+    far.close()
 
 
 async def test_the_moment_comes_when_nothing_is_under_way_and_an_exec_that_fails_leaves_everything_as_it_was(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     ours, theirs = socket.socketpair()
-    state, looks = (
-        empty(server=ServerState(1, ours.fileno(), b"")),
-        iter([False, True, False, True, False] + [True] * 9),
-    )
+    state = empty(server=ServerState(1, ours.fileno(), b""))
+    looks = iter([False, True, False, True, False] + [True] * 9)
     seen: list[tuple[bool, bool]] = []
 
     def fail(*_: object) -> None:
@@ -295,10 +293,9 @@ async def test_the_moment_comes_when_nothing_is_under_way_and_an_exec_that_fails
 
     monkeypatch.setattr(replacement, "LOOK_S", 0.0)
     monkeypatch.setattr(os, "execv", fail)
-    with pytest.raises(HandoverError, match="Exec format error"):
-        await replace(python(READS), lambda: state if next(looks) else None)
+    with pytest.raises(OSError, match="Exec format error"):
+        await replace(["zbridge"], lambda: state if next(looks) else None, agree)
     assert seen == [(True, True)]
-    assert not os.get_inheritable(ours.fileno())
     assert not signal.pthread_sigmask(signal.SIG_BLOCK, ()) & set(SIGNALS)
     ours.close()
     theirs.close()
@@ -307,12 +304,12 @@ async def test_the_moment_comes_when_nothing_is_under_way_and_an_exec_that_fails
 async def test_without_such_a_moment_nothing_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(replacement, "CALM_S", 0.0)
     with pytest.raises(HandoverError, match="was being started or ended"):
-        await replace(["false"], lambda: None)
+        await replace(["false"], lambda: None, agree)
 
 
 async def test_files_are_read_off_the_event_loop_which_watches_the_gateways(monkeypatch: pytest.MonkeyPatch) -> None:
     forks: Any = PlayedForks()
-    supervisor, looked = Supervisor((), HostSettings(), forks, watch=True, verbose=False), threading.Event()
+    supervisor, looked = Supervisor(SupervisorState((), watch=True), forks), threading.Event()
     seen: list[bool] = []
 
     def poll(_: Follower, running: object, *, twice: bool) -> Changes:
@@ -334,35 +331,38 @@ async def test_files_are_read_off_the_event_loop_which_watches_the_gateways(monk
 class PlayedForks:
     """The fork server of an installation that the test names."""
 
-    stamp: str | None = "one"
+    stamp: bytes | None = b"one"
     refused = unsettled = False
 
     async def renew(self) -> None:
+        pass
+
+    async def rehearse(self, state: int) -> None:
         pass
 
 
 @pytest.mark.parametrize(
     ("stamp", "asked", "forced", "refused", "replaced"),
     [
-        ("one", True, False, False, 0),
-        ("two", False, False, False, 1),
-        ("two", True, False, False, 1),
-        ("one", True, True, False, 1),
-        ("one", True, True, True, 0),
+        (b"one", True, False, False, 0),
+        (b"two", False, False, False, 1),
+        (b"two", True, False, False, 1),
+        (b"one", True, True, False, 1),
+        (b"one", True, True, True, 0),
     ],
 )
 async def test_the_supervisor_is_replaced_when_its_fork_server_was_or_when_it_is_told_to(
-    monkeypatch: pytest.MonkeyPatch, *, stamp: str, asked: bool, forced: bool, refused: bool, replaced: int
+    monkeypatch: pytest.MonkeyPatch, *, stamp: bytes, asked: bool, forced: bool, refused: bool, replaced: int
 ) -> None:
     calls: list[object] = []
 
     async def refuse(*arguments: object) -> None:
         calls.append(arguments)
-        raise HandoverError("not now")
+        raise NotReady("not now")
 
     monkeypatch.setattr(module, "replace", refuse)
     forks: Any = PlayedForks()
-    supervisor = Supervisor((), HostSettings(), forks, watch=False, verbose=False, itself=["zbridge"])
+    supervisor = Supervisor(SupervisorState(()), forks)
     forks.stamp, forks.refused = stamp, refused
     if forced:
         supervisor.renew()
@@ -370,3 +370,23 @@ async def test_the_supervisor_is_replaced_when_its_fork_server_was_or_when_it_is
     assert len(calls) == replaced
     await supervisor.follow_code(asked=False)
     assert len(calls) == replaced, "what failed is tried again when somebody asks"
+
+
+async def test_a_supervisor_that_is_told_to_replace_its_code_waits_until_the_installer_has_ended(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    commands: list[list[str]] = []
+
+    async def note(command: list[str], *_: object) -> None:
+        commands.append(command)
+
+    monkeypatch.setattr(module, "replace", note)
+    forks: Any = PlayedForks()
+    supervisor = Supervisor(SupervisorState(("robots",), watch=True), forks)
+    forks.unsettled = True
+    supervisor.renew()
+    await supervisor.follow_code(asked=True)
+    assert commands == []
+    forks.unsettled = False
+    await supervisor.follow_code(asked=False)
+    assert [command[-4:] for command in commands] == [["zbridge", "run", "--watch", "robots"]]

@@ -380,13 +380,12 @@ async def test_a_changed_file_whose_successor_cannot_be_started_ends_the_process
 ) -> None:
     first = await scene.child(0)
     await scene.until(lambda: scene.runner.process is not None and scene.runner.process.hands_over)
-    restarting = asyncio.ensure_future(scene.runner.restart(scene.runner.file))
+    scene.runner.restart(scene.runner.file)
     scene.launcher.refuses = [NotReady("no fork server")]
     near, far = socket.socketpair()
     with near, far:
         first.tell(WantSuccessor(), far.fileno())
         assert (await first.answer()).reason == "no fork server"
-    await asyncio.wait_for(restarting, SOON_S)  # nothing else is waited for
     assert (await scene.child(1)).file == scene.runner.file
     assert (scene.runner.restarts, scene.runner.state) == (0, "offline"), "it was asked for"
 
@@ -423,7 +422,7 @@ async def test_a_file_that_changes_while_its_process_dies_restarts_the_process_t
     first.serves("first")
     await scene.until(lambda: scene.runner.process is not None and scene.runner.process.deposit.deposited is not None)
     changed = msgspec.structs.replace(scene.runner.file, content=b"changed")
-    restarting = asyncio.ensure_future(scene.runner.restart(changed))
+    scene.runner.restart(changed)
     await asyncio.sleep(0)
     first.dies()
     second = await scene.child(1)
@@ -435,8 +434,6 @@ async def test_a_file_that_changes_while_its_process_dies_restarts_the_process_t
     third = await scene.successor(second)
     second.tell(Succeeded())
     assert third is scene.launcher.children[2]
-    restarting.cancel()
-    await asyncio.wait([restarting])
 
 
 @pytest.mark.parametrize("failure", ["pair", "inheritance"])

@@ -13,9 +13,8 @@ import pytest
 from zbridge.errors import ConfigError
 from zbridge.host import supervisor as module
 from zbridge.host.files import Changes, Follower, RobotFile
-from zbridge.host.replacement import VERSION, RunnerState
+from zbridge.host.replacement import RunnerState, ServerState, SupervisorState
 from zbridge.host.runners import LATE_S, READY_S, STATUS_S, Reports, Runners
-from zbridge.host.settings import HostSettings
 from zbridge.host.supervisor import Supervisor
 from zbridge.host.watchdog import DRIVEN_S, EXTENSION_S, IDLE_S, Watchdog
 
@@ -72,7 +71,7 @@ class Runner:
     async def run(self) -> None:
         self.done.append("run")
 
-    async def restart(self, robot: RobotFile) -> None:
+    def restart(self, robot: RobotFile) -> None:
         self.done.append(robot)
 
     async def end(self) -> None:
@@ -94,9 +93,9 @@ class Systemd:
 
 
 class ForkClient:
-    stamp: str | None = "one"
+    stamp: bytes | None = b"one"
     refused = unsettled = False
-    state = (None, (7,))
+    state = ServerState(7, 8, b"one")
 
     async def renew(self) -> None:
         """The installation is as it was."""
@@ -143,7 +142,7 @@ class Supervised(Scene):
         monkeypatch.setattr(module, "Runner", Runner)
         monkeypatch.setattr(module, "Systemd", lambda: self.systemd)
         forks: Any = ForkClient()
-        self.supervisor = Supervisor((), HostSettings(), forks, watch=False, verbose=False)
+        self.supervisor = Supervisor(SupervisorState(()), forks)
         self.runners = self.supervisor.runners
 
 
@@ -350,7 +349,7 @@ async def test_everything_is_kept_for_the_code_in_its_place_when_nothing_is_unde
     await asyncio.sleep(0.001)
     state = supervisor.snapshot()
     assert state is not None
-    assert (state.version, state.at, state.leaving) == (VERSION, 100.0, (7,))
+    assert (state.at, state.server) == (100.0, ForkClient.state)
     assert [(each.path, each.content) for each in state.runners] == [("r1.toml", b"one")]
     assert state.faults == {"r2.toml": "colour"}, "a name that cannot be written is looked at anew"
     scene.runner("r1").is_idle = False

@@ -145,9 +145,8 @@ class Serving:
             self._camera_failed.set_exception(error)
 
     async def _close(self) -> None:
-        shown, self._shown = self._shown, []
-        for handle in shown:
-            handle.close()
+        while self._shown:
+            self._shown.pop().close()
         filming, self._filming = self._filming, None
         if filming is not None:
             filming.cancel()

@@ -48,10 +48,10 @@ def main() -> None:
                 run_gateway(Path(file))
             case ["run", file, "--take-over", descriptor] if not file.startswith("-"):
                 run_gateway(Path(file), take_over=int(descriptor))
-            case ["run", *_, "--resume" | "--resume-check" as option, descriptor] if descriptor.isdecimal():
+            case ["run", *_, "--resume", descriptor] if descriptor.isdecimal():
                 from zbridge.cli.supervise import resume
 
-                resume(int(descriptor), only_check=option == "--resume-check")
+                resume(int(descriptor))
             case _:
                 from zbridge.cli.app import app
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, TypeVar
 
+import msgspec
 import typer
 
 from zbridge.bus.tls.files import TLS_VARIABLE
@@ -37,6 +39,14 @@ FileTls = Annotated[
         show_default=False,
     ),
 ]
+
+
+S = TypeVar("S", bound=msgspec.Struct)
+
+
+def chosen(options: type[S], parameters: Mapping[str, Any]) -> S:
+    """Make the options of a command of its parameters (``locals()``): they have the names of the fields."""
+    return options(**{name: parameters[name] for name in options.__struct_fields__})
 
 
 def check_name(argument: str, name: str) -> None:

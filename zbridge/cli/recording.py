@@ -50,15 +50,15 @@ class RecordOptions(msgspec.Struct, frozen=True, kw_only=True):
     """The options of ``zbridge record`` as they were written."""
 
     output: Path
-    robots: tuple[str, ...]
-    keys: str | None
-    only: str | None
+    robots: Sequence[str]
+    keys: str
+    only: str
     wire: bool
-    split: str | None
-    keep: int | None
-    duration: str | None
+    split: str
+    keep: int
+    duration: str
     compression: str
-    configs: tuple[Path, ...]
+    config: Sequence[Path]
     buffer: str
     realm: str
 
@@ -69,7 +69,7 @@ def _tape_settings(options: RecordOptions) -> TapeSettings:
         raise ConfigError("keep: needs --split")
     if options.compression not in ("zstd", "lz4", "none"):
         raise ConfigError(f"compression = {options.compression!r}: expected one of 'zstd', 'lz4', 'none'")
-    settings = TapeSettings(options.output, options.compression, split_bytes, split_s, options.keep)  # type: ignore[arg-type]
+    settings = TapeSettings(options.output, options.compression, split_bytes, split_s, options.keep or None)  # type: ignore[arg-type]
     taken = settings.file(1)
     if taken.exists():
         raise ConfigError(f"{taken} exists: give another name")
@@ -82,16 +82,16 @@ def _metadata(options: RecordOptions) -> dict[str, dict[str, str]]:
         "realm": options.realm,
         "robots": ", ".join(options.robots) or options.keys or "all",
         "wire": str(options.wire).lower(),
-        "only": options.only or "",
+        "only": options.only,
         "began": datetime.now().astimezone().isoformat(timespec="seconds"),
     }
-    configurations = {f"configuration/{path.name}": describe_configuration(path) for path in options.configs}
+    configurations = {f"configuration/{path.name}": describe_configuration(path) for path in options.config}
     return {"zbridge": made, **configurations}
 
 
 async def run_record(settings: BusSettings, options: RecordOptions) -> bool:
     """Record until a signal, the end of the duration, or of the disk; False if the recording failed."""
-    if options.only not in (None, "fleet", "foxglove"):
+    if options.only not in ("", "fleet", "foxglove"):
         raise ConfigError(f"only = {options.only!r}: expected 'fleet' or 'foxglove'")
     if not is_name(options.realm):
         raise ConfigError(f"realm = {options.realm!r}: expected letters, digits, '_', '.' and '-' only")
@@ -110,7 +110,7 @@ async def run_record(settings: BusSettings, options: RecordOptions) -> bool:
         pictures=Pictures() if options.only != "fleet" else None,
         failed=lambda: loop.call_soon_threadsafe(full.set),
     )
-    plan = RecordPlan(options.realm, options.robots, keys, options.wire)
+    plan = RecordPlan(options.realm, tuple(options.robots), keys, options.wire)
     async with joined(settings, options.realm) as bus:
         recorder.start()
         recording = BusCapture(bus, plan, intake)
@@ -211,24 +211,24 @@ def run_export(path: Path, output: Path | None, keys: str, since: str, until: st
 class ReplayOptions(msgspec.Struct, frozen=True, kw_only=True):
     """The options of ``zbridge replay`` as they were written."""
 
-    path: Path
+    file: Path
     realm: str
-    robots: tuple[str, ...]
+    robots: Sequence[str]
     speed: float
     loop: bool
     since: str
     until: str
     pause: bool
-    hq: tuple[str, ...]
+    hq: Sequence[str]
 
 
 def _plan(options: ReplayOptions) -> ReplayPlan:
-    seen, begin_ns = survey(options.path), first_ns(options.path)
+    seen, begin_ns = survey(options.file), first_ns(options.file)
     names = plan_names(seen.robots, options.robots)
     if options.hq and len(names) > 1:
         raise ConfigError(f"hq: serves one robot, and the replay has {', '.join(names)}: choose one by --robot")
     return ReplayPlan(
-        path=options.path,
+        path=options.file,
         realm=options.realm,
         names=names,
         selection=read_selection(begin_ns, options.since, options.until),

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from zbridge.cli import give_up, run_command
-from zbridge.cli.options import Connect, Realm, TlsFolder, check_name
+from zbridge.cli.options import Connect, Realm, TlsFolder, check_name, chosen
 from zbridge.client import bus_settings
 
 app = typer.Typer()
@@ -18,31 +18,30 @@ Recorded = Annotated[Path, typer.Argument(help="a recording (MCAP)", show_defaul
 Since = Annotated[str, typer.Option("--from", help="begin here: 12.5, 1:30, or a time of day: 2026-11-22T05:00:00")]
 Until = Annotated[str, typer.Option("--to", help="end here; written as --from")]
 NewNames = Annotated[
-    list[str] | None,
+    list[str],
     typer.Option(
+        "--robot",
         help="the new name; of several robots RECORDED=NEW for each. By default all, as NAME-replay; "
-        "with --as-robot: which robot of the recording"
+        "with --as-robot: which robot of the recording",
     ),
 ]
 HqListeners = Annotated[
-    list[str] | None,
+    list[str],
     typer.Option(help="serve HQ programs: PROTOCOL:PORT, PROTOCOL:HOST:PORT or a file with [[hq]]"),
 ]
 AsRobot = Annotated[
     str, typer.Option("--as-robot", help="act as the legacy robot, from its raw frames; the name of its protocol")
 ]
-Listen = Annotated[
-    list[str] | None, typer.Option(help="where the legacy robot listens, tcp://host:port; once for each link")
-]
+Listen = Annotated[list[str], typer.Option(help="where the legacy robot listens, tcp://host:port; once for each link")]
 Configurations = Annotated[
-    list[Path] | None,
+    list[Path],
     typer.Option(help="a gateway's configuration, to be kept in the recording without its secrets"),
 ]
 
 
 @app.command()
 def record(
-    robots: Annotated[list[str] | None, typer.Argument(help="names of robots", show_default=False)] = None,
+    robots: Annotated[list[str], typer.Argument(help="names of robots", show_default=False)] = [],
     output: Annotated[Path, typer.Option("-o", "--output", help="the file to write (MCAP)", show_default=False)] = ...,  # type: ignore[assignment]
     everything: Annotated[bool, typer.Option("--all", help="every robot of the realm")] = False,
     keys: Annotated[str, typer.Option(help="a key expression instead of robots")] = "",
@@ -52,9 +51,9 @@ def record(
     keep: Annotated[int, typer.Option(help="keep the last N files; with --split", min=0)] = 0,
     duration: Annotated[str, typer.Option(help="end after this time: 90s, 10min, 1h")] = "",
     compression: Annotated[str, typer.Option(help="zstd, lz4 or none")] = "zstd",
-    config: Configurations = None,
+    config: Configurations = [],
     buffer: Annotated[str, typer.Option(help="size of the queue for a slow disk")] = "64MiB",
-    connect: Connect = [],  # noqa: B006
+    connect: Connect = [],
     tls: TlsFolder = None,
     realm: Realm = "fleet",
 ) -> None:
@@ -63,22 +62,10 @@ def record(
 
     if sum(map(bool, (robots, everything, keys))) != 1:
         give_up(2, "name ROBOTs, or give --all or --keys")
-    for robot in robots or ():
+    for robot in robots:
         check_name("ROBOT", robot)
-    options = RecordOptions(
-        output=output,
-        robots=tuple(dict.fromkeys(robots or ())),
-        keys=keys or None,
-        only=only or None,
-        wire=wire,
-        split=split or None,
-        keep=keep or None,
-        duration=duration or None,
-        compression=compression,
-        configs=tuple(config or ()),
-        buffer=buffer,
-        realm=realm,
-    )
+    robots = list(dict.fromkeys(robots))
+    options = chosen(RecordOptions, locals())
     run_command(run_record(bus_settings(connect, tls), options), level=logging.WARNING)
 
 
@@ -117,7 +104,7 @@ def export(
 def mark(
     text: Annotated[str, typer.Argument(help="what happened", show_default=False)],
     who: Annotated[str, typer.Option(help="author of the mark; user@host by default")] = "",
-    connect: Connect = [],  # noqa: B006
+    connect: Connect = [],
     tls: TlsFolder = None,
     realm: Realm = "fleet",
 ) -> None:
@@ -130,16 +117,16 @@ def mark(
 @app.command()
 def replay(
     file: Recorded,
-    robot: NewNames = None,
+    robots: NewNames = [],
     speed: Annotated[float, typer.Option(help="seconds of the recording per second", min=0.01, max=1000.0)] = 1.0,
     loop: Annotated[bool, typer.Option("--loop", help="start over at the end")] = False,
     since: Since = "",
     until: Until = "",
     pause: Annotated[bool, typer.Option("--pause", help="start paused; Enter resumes, and pauses again")] = False,
-    hq: HqListeners = None,
+    hq: HqListeners = [],
     as_robot: AsRobot = "",
-    listen: Listen = None,
-    connect: Connect = [],  # noqa: B006
+    listen: Listen = [],
+    connect: Connect = [],
     tls: TlsFolder = None,
     realm: Realm = "fleet",
 ) -> None:
@@ -151,17 +138,7 @@ def replay(
     if as_robot:
         if hq or loop or pause or since or until:
             give_up(2, "--as-robot replays the whole recording once: not with --hq, --loop, --pause, --from, --to")
-        run_command(run_wire(file, as_robot, listen or [], robot or [], speed, realm), level=logging.WARNING)
+        run_command(run_wire(file, as_robot, listen, robots, speed, realm), level=logging.WARNING)
         return
-    options = ReplayOptions(
-        path=file,
-        realm=realm,
-        robots=tuple(robot or ()),
-        speed=speed,
-        loop=loop,
-        since=since,
-        until=until,
-        pause=pause,
-        hq=tuple(hq or ()),
-    )
+    options = chosen(ReplayOptions, locals())
     run_command(run_replay(bus_settings(connect, tls), options), level=logging.WARNING)

@@ -21,6 +21,10 @@ app = typer.Typer()
 Recorded = Annotated[
     Path | None, typer.Argument(help="a recording (MCAP) to play, instead of live robots", show_default=False)
 ]
+ShownRobots = Annotated[list[str], typer.Option("--robot", help="show this robot only; once for each; all by default")]
+Origins = Annotated[
+    list[str], typer.Option("--origin", help="Origin of another web page that may connect; once for each")
+]
 FullSpeeds = Annotated[list[str], typer.Option(help="m/s at full scale, NUMBER or ROBOT=NUMBER; 1 by default")]
 FullTurns = Annotated[list[str], typer.Option(help="rad/s at full scale, NUMBER or ROBOT=NUMBER; 1 by default")]
 DriverName = Annotated[
@@ -32,10 +36,10 @@ DriverName = Annotated[
 def foxglove(
     file: Recorded = None,
     listen: Annotated[str, typer.Option(help="host:port for Foxglove; port 0: any free one")] = "127.0.0.1:8765",
-    robot: Annotated[list[str], typer.Option(help="show this robot only; once for each; all by default")] = [],
+    robots: ShownRobots = [],
     drive: Annotated[bool, typer.Option("--drive", help="let viewers with the token or a listed Origin drive")] = False,
     token: Annotated[Path | None, typer.Option(help="file with the token that viewers must give (?token=)")] = None,
-    origin: Annotated[list[str], typer.Option(help="Origin of another web page that may connect; once for each")] = [],
+    origins: Origins = [],
     allow: Annotated[list[str], typer.Option(help="network that viewers may connect from; once for each")] = [],
     tls_certificate: Annotated[Path | None, typer.Option(help="certificate (PEM), for wss://")] = None,
     tls_key: Annotated[Path | None, typer.Option(help="its key (PEM)")] = None,
@@ -54,23 +58,7 @@ def foxglove(
     from zbridge.cli.viewers import run_foxglove
 
     set_up_log(verbose=verbose)
-    given: dict[str, object] = {
-        "listen": listen,
-        "robots": robot,
-        "drive": drive,
-        "token": token,
-        "origins": origin,
-        "allow": allow,
-        "tls_certificate": tls_certificate,
-        "tls_key": tls_key,
-        "insecure": insecure,
-        "speed_full_mps": speed_full_mps,
-        "turn_full_radps": turn_full_radps,
-        "who": who,
-        "viewers": viewers,
-        "metrics": metrics,
-    }
-    run_foxglove(bus_settings(connect, tls), realm, file, given)
+    run_foxglove(bus_settings(connect, tls), realm, file, locals())
 
 
 @app.command()
@@ -200,7 +188,7 @@ def ros2(
         Path | None, typer.Argument(help="settings (TOML): speeds, sizes, option defaults", show_default=False)
     ] = None,
     domain: Annotated[int | None, typer.Option(help="ROS_DOMAIN_ID; 0 by default", show_default=False)] = None,
-    robot: Annotated[list[str], typer.Option(help="show this robot only; once for each; all by default")] = [],
+    robots: ShownRobots = [],
     drive: Annotated[bool, typer.Option("--drive", help="let cmd_vel publishers drive, and services switch")] = False,
     distro: Annotated[
         str, typer.Option(help="humble, iron, jazzy, kilted or lyrical; jazzy by default", show_default=False)
@@ -219,7 +207,7 @@ def ros2(
     set_up_log(verbose=verbose)
     options: dict[str, object] = {
         "domain": domain,
-        "robots": tuple(robot) or None,
+        "robots": tuple(robots) or None,
         "drive": drive or None,
         "distro": distro or None,
         "ros": tuple(ros) or None,

@@ -10,8 +10,8 @@ from pathlib import Path
 from zbridge.app import until_signal
 from zbridge.cli import set_up_log
 from zbridge.errors import ConfigError
-from zbridge.host.fork_client import ForkClient, fork_server_command, module_command
-from zbridge.host.replacement import restore
+from zbridge.host.fork_client import ForkClient, fork_server_command
+from zbridge.host.replacement import SupervisorState, restore
 from zbridge.host.settings import HostSettings, load_host
 from zbridge.host.supervisor import Supervisor
 
@@ -21,46 +21,21 @@ def supervise(paths: tuple[Path, ...], *, watch: bool, verbose: bool) -> None:
     set_up_log(verbose=False)
     if missing := [path for path in paths if not path.exists()]:
         raise ConfigError(f"{missing[0]}: No such file or directory")
-    itself = _itself(paths, watch=watch, verbose=verbose)
-    supervisor = Supervisor(paths, _host(paths), _forks(), watch=watch, verbose=verbose, itself=itself)
-    _run(supervisor)
+    _run(SupervisorState(tuple(map(str, paths)), watch, verbose, _host(paths)))
 
 
-def resume(descriptor: int, *, only_check: bool) -> None:
-    """Continue as a supervisor, in place of the code that left the state behind ``descriptor``.
-
-    only_check: end at once, with an error where the state cannot be taken. Raises HandoverError.
-    """
+def resume(descriptor: int) -> None:
+    """Continue as a supervisor, in place of the code that left the state behind a descriptor; raise HandoverError."""
     set_up_log(verbose=False)
     state = restore(descriptor)
-    paths = tuple(map(Path, state.sources))
-    supervisor = Supervisor(
-        paths,
-        HostSettings(stagger_s=state.stagger_s, file_bytes=state.file_bytes),
-        _forks(),
-        watch=state.watch,
-        verbose=state.verbose,
-        itself=_itself(paths, watch=state.watch, verbose=state.verbose),
-        resumed=state,
-    )
-    if not only_check:
-        os.close(descriptor)
-        _run(supervisor)
+    os.close(descriptor)
+    _run(state)
 
 
-def _run(supervisor: Supervisor) -> None:
+def _run(state: SupervisorState) -> None:
+    supervisor = Supervisor(state, ForkClient(fork_server_command()))
     gc.freeze()
     asyncio.run(until_signal(supervisor.run()))
-
-
-def _forks() -> ForkClient:
-    return ForkClient(fork_server_command())
-
-
-def _itself(paths: tuple[Path, ...], *, watch: bool, verbose: bool) -> list[str]:
-    """Return the command that runs the installed code in place of this one; its options show in process lists."""
-    options = ["--watch"] * watch + ["--verbose"] * verbose
-    return [*module_command("zbridge"), "run", *options, *map(str, paths)]
 
 
 def _host(paths: tuple[Path, ...]) -> HostSettings:

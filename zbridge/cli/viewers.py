@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -12,18 +12,18 @@ from zbridge.app import until_signal
 from zbridge.bus import BusSettings
 from zbridge.bus.tls.files import own_name, own_role
 from zbridge.cli import run_loop
+from zbridge.cli.options import chosen
 from zbridge.errors import ConfigError
 from zbridge.metrics import Metrics
 from zbridge.toml import convert, read_toml
 
 if TYPE_CHECKING:
     from zbridge.views.foxglove.server import ViewerServer
-    from zbridge.views.foxglove.settings import FoxgloveOptions
     from zbridge.views.ros2.server import View
 
 
-def run_foxglove(bus: BusSettings, realm: str, file: Path | None, given: dict[str, object]) -> None:
-    """Serve until SIGTERM or SIGINT; raise ConfigError. given: fields of FoxgloveOptions, as they were given."""
+def run_foxglove(bus: BusSettings, realm: str, file: Path | None, given: dict[str, Any]) -> None:
+    """Serve until SIGTERM or SIGINT; raise ConfigError. given: those of FoxgloveOptions, and others."""
     try:
         from zbridge.views.foxglove import server
         from zbridge.views.foxglove.settings import FoxgloveOptions, plan
@@ -31,7 +31,7 @@ def run_foxglove(bus: BusSettings, realm: str, file: Path | None, given: dict[st
         raise ConfigError(f"{error}: install the extra: pip install 'zbridge[foxglove]'") from error
     gc.freeze()  # objects made at start-up live as long as the process; the collector skips them
     given["who"] = given["who"] or own_name(bus.tls) or "foxglove"
-    options: FoxgloveOptions = FoxgloveOptions(**given)  # type: ignore[arg-type]
+    options = chosen(FoxgloveOptions, given)
     if options.drive and (role := own_role(bus.tls)) in ("viewer", "recorder"):
         raise ConfigError(f"--drive: a {role} may not drive: expected the certificate of an operator")
     planned, metrics = plan(options), Metrics()

@@ -54,8 +54,12 @@ class Duplicate(msgspec.Struct):
 
     def close(self) -> None:
         """Close the duplicates; idempotent."""
-        close_all([number for number in (self.stream, self.datagrams) if number is not None])
+        close_all(self.descriptors)
         self.stream = self.datagrams = None
+
+    @property
+    def descriptors(self) -> tuple[int, ...]:
+        return tuple(number for number in (self.stream, self.datagrams) if number is not None)
 
     def discard_input(self) -> None:
         """Read what waits, and discard it."""
@@ -120,14 +124,8 @@ class Duplicates:
     def __len__(self) -> int:
         return len(self._links)
 
-    @property
-    def state(self) -> tuple[Duplicate, ...]:
-        """The descriptors and the boundaries of the streams, for :meth:`resume`."""
-        return tuple(self._links.values())
-
-    def resume(self, links: Sequence[Duplicate]) -> None:
-        """Resume with descriptors that are open already."""
-        self._links.update({each.link: each for each in links})
+    def __iter__(self) -> Iterator[Duplicate]:
+        return iter(self._links.values())
 
     def opened(self, link: int, name: str, descriptors: Sequence[int], *, drives: bool) -> None:
         """Keep the descriptors of a link; too many links, and what is no socket or line, are closed at once."""

@@ -8,9 +8,10 @@ not sent. A message holds at most :data:`MESSAGE_BYTES`.
 from __future__ import annotations
 
 import array
+import contextlib
 import os
 import socket
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import msgspec
 
@@ -100,10 +101,14 @@ class Fork(msgspec.Struct, frozen=True, tag="fork"):
 
 
 class Forked(msgspec.Struct, frozen=True, tag="forked"):
-    """The answer: the process id. pid 0: it could not be forked, for this reason."""
+    """The answer: the process id. pid 0: it could not be done, for this reason."""
 
     pid: int
     reason: str | None = None
+
+
+class Rehearse(msgspec.Struct, frozen=True, tag="rehearse"):
+    """Be a supervisor in place of another one, short of running; its state comes along. :class:`Forked` answers."""
 
 
 class Ready(msgspec.Struct, frozen=True, tag="ready"):
@@ -112,7 +117,7 @@ class Ready(msgspec.Struct, frozen=True, tag="ready"):
     threads: int = 1
 
 
-Message = FromGateway | Started | Fork | Forked | Ready
+Message = FromGateway | Started | Fork | Forked | Rehearse | Ready
 _encode = msgspec.msgpack.Encoder().encode
 _decode = msgspec.msgpack.Decoder(Message).decode
 
@@ -202,3 +207,11 @@ def close_all(descriptors: Sequence[int]) -> None:
     """Close file descriptors."""
     for descriptor in descriptors:
         os.close(descriptor)
+
+
+@contextlib.contextmanager
+def in_memory(name: str, content: bytes) -> Iterator[int]:
+    """Write bytes to memory, and give its descriptor while the context lasts. Raises OSError."""
+    with os.fdopen(os.memfd_create(name), "wb", buffering=0) as file:
+        file.write(content)  # memory takes all of it, or nothing
+        yield file.fileno()

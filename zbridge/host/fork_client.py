@@ -13,13 +13,13 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
 from zbridge.errors import NotReady
-from zbridge.host.fd_channel import FdChannel, Fork, Forked, Message, Ready, close_all
-from zbridge.host.replacement import NOT_INHERITED, ServerState
+from zbridge.host.fd_channel import FdChannel, Fork, Forked, Message, Ready, Rehearse, close_all, in_memory
+from zbridge.host.replacement import ServerState
 from zbridge.protocol.plugin import GROUP
 
 log = logging.getLogger("zbridge.host")
@@ -32,43 +32,29 @@ READY_S = 60.0
 """Longest time in which a fork server imports everything."""
 CHECK_S = 2.0
 """Least time between two checks of the installation, which take 25 ms, for the sake of forks."""
-FORK_S = 10.0
-"""Longest time for one fork."""
+ANSWER_S = 10.0
+"""Longest time for one fork, or rehearsal."""
+NOT_INHERITED = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
+"""Variables of systemd for this process only."""
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 """Variables for numpy's libraries, to be set before they are loaded: they must start no threads."""
 
 
-class Installation:
-    """What is installed now. Two are equal if no file of the code differs in size and time of change."""
+def installed() -> tuple[bytes, bool]:
+    """Return the stamp of what is installed now, and whether nothing of it changed for :data:`SETTLED_S`.
 
-    def __init__(self) -> None:
-        digest, newest_ns = hashlib.blake2b(digest_size=16), 0
-        for path in _files():
-            try:
-                state = path.stat()
-            except OSError:  # an installer replaces it at this moment
-                newest_ns = time.time_ns()
-                continue
-            digest.update(f"{path}\0{state.st_size}\0{state.st_mtime_ns}\0".encode())
-            newest_ns = max(newest_ns, state.st_mtime_ns, state.st_ctime_ns)
-        self.digest = digest.digest()
-        self.settled = abs(time.time_ns() - newest_ns) > SETTLED_S * 1e9
-        """Whether nothing changed for :data:`SETTLED_S`."""
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Installation) and self.digest == other.digest
-
-    @classmethod
-    def of(cls, digest: bytes) -> Installation:
-        """Make one that was checked before, from its digest."""
-        stamp = cls.__new__(cls)
-        stamp.digest, stamp.settled = digest, True
-        return stamp
-
-    __hash__ = None  # type: ignore[assignment]
-
-    def __repr__(self) -> str:
-        return f"<Installation {self.digest.hex()[:8]}>"
+    Two stamps are equal if no file of the code differs in size and time of change.
+    """
+    digest, newest_ns = hashlib.blake2b(digest_size=16), 0
+    for path in _files():
+        try:
+            state = path.stat()
+        except OSError:  # an installer replaces it at this moment
+            newest_ns = time.time_ns()
+            continue
+        digest.update(f"{path}\0{state.st_size}\0{state.st_mtime_ns}\0".encode())
+        newest_ns = max(newest_ns, state.st_mtime_ns, state.st_ctime_ns)
+    return digest.digest(), abs(time.time_ns() - newest_ns) > SETTLED_S * 1e9
 
 
 def _files() -> list[Path]:
@@ -86,52 +72,21 @@ def _protocol_packages() -> set[Path]:
     return {Path(spec.origin).parent for spec in specs if spec is not None and spec.has_location and spec.origin}
 
 
-class _Adopted:
-    """A child that the code before this one has started: as much of a ``Popen`` as is needed here."""
-
-    def __init__(self, pid: int) -> None:
-        self.pid = pid
-        self._ended = False
-
-    @property
-    def ended(self) -> bool:
-        return self.poll() is not None
-
-    def poll(self) -> int | None:
-        return self._wait(os.WNOHANG)
-
-    def wait(self) -> int | None:
-        return self._wait(0)
-
-    def _wait(self, options: int) -> int | None:
-        if not self._ended:
-            try:
-                self._ended = os.waitpid(self.pid, options)[0] != 0
-            except ChildProcessError:
-                self._ended = True
-        return 0 if self._ended else None
-
-    def kill(self) -> None:
-        if not self._ended:
-            os.kill(self.pid, signal.SIGKILL)
-
-
 class _Server:
-    """One running fork server. Answers come in the order of the requests."""
+    """One running fork server, a child of this process. Answers come in the order of the requests."""
 
-    def __init__(self, process: subprocess.Popen[bytes] | _Adopted, channel: FdChannel, stamp: Installation) -> None:
-        self.stamp = stamp
+    def __init__(self, state: ServerState) -> None:
+        self.state = state
         self.alive = True
-        self._process = process
-        self._channel = channel
+        self._channel = FdChannel.inherited(state.channel)
         self._answers: asyncio.Queue[Message | None] = asyncio.Queue()
-        asyncio.get_running_loop().add_reader(channel.fileno(), self._receive)
+        asyncio.get_running_loop().add_reader(state.channel, self._receive)
 
     @classmethod
-    async def start(cls, command: Sequence[str], stamp: Installation) -> _Server:
+    async def start(cls, command: Sequence[str], stamp: bytes) -> _Server:
         """Start one, and wait until it can fork; raise NotReady with the reason."""
         try:
-            server = cls(*_spawned(command), stamp)
+            server = cls(_spawned(command, stamp))
         except OSError as error:
             raise NotReady(f"the fork server did not start: {error.strerror or error}") from error
         answer = await server._answer(READY_S)
@@ -141,24 +96,11 @@ class _Server:
             raise NotReady(f"the fork server did not start{more}")
         return server
 
-    @classmethod
-    def resume(cls, state: ServerState) -> _Server:
-        """Resume one that the code before this one has started."""
-        return cls(_Adopted(state.pid), FdChannel.inherited(state.channel), Installation.of(state.stamp))
-
-    @property
-    def pid(self) -> int:
-        return self._process.pid
-
-    @property
-    def state(self) -> ServerState:
-        return ServerState(self.pid, self._channel.fileno(), self.stamp.digest)
-
-    async def fork(self, request: Fork, descriptors: Sequence[int]) -> int:
-        """Fork a gateway and return its process id; raise NotReady with the reason."""
+    async def ask(self, request: Fork | Rehearse, descriptors: Sequence[int]) -> int:
+        """Let it do something; return the process id that it answers. Raise NotReady with the reason."""
         if not self._channel.send(request, descriptors):
             raise NotReady("the fork server accepts no request")
-        answer = await self._answer(FORK_S)
+        answer = await self._answer(ANSWER_S)
         if not isinstance(answer, Forked) or not answer.pid:
             raise NotReady((isinstance(answer, Forked) and answer.reason) or "the fork server is gone")
         return answer.pid
@@ -185,22 +127,17 @@ class _Server:
         self._answers.put_nowait(message)
 
     def close(self) -> None:
-        """Let it end; idempotent. The gateways that it forked live on."""
+        """Ask nothing of it any more; idempotent."""
         if self.alive:
             self.alive = False
-            asyncio.get_running_loop().remove_reader(self._channel.fileno())
+            asyncio.get_running_loop().remove_reader(self.state.channel)
             self._channel.close()
 
     def kill(self) -> None:
+        """End it, and wait for its end. The gateways that it forked live on."""
         self.close()
-        with contextlib.suppress(ProcessLookupError):
-            self._process.kill()
-        self._process.wait()
-
-    @property
-    def ended(self) -> bool:
-        """Whether its process has ended; reaps it."""
-        return self._process.poll() is not None
+        os.kill(self.state.pid, signal.SIGKILL)  # not waited for yet: nobody else has the number
+        os.waitpid(self.state.pid, 0)
 
 
 class ForkClient:
@@ -209,25 +146,24 @@ class ForkClient:
     def __init__(self, command: Sequence[str]) -> None:
         self._command = command
         self._server: _Server | None = None
-        self._refused: Installation | None = None
+        self._refused: bytes | None = None
         """The installation whose fork server did not start."""
-        self._leaving: list[_Server | _Adopted] = []
         self.unsettled = False
         """Whether the installation was being changed when it was checked last."""
         self._checked_at = -math.inf
         self._turn = asyncio.Lock()
 
     def __repr__(self) -> str:
-        return f"<ForkClient by {self._server.pid if self._server is not None else None}>"
+        return f"<ForkClient by {self.pid}>"
 
     @property
     def pid(self) -> int | None:
-        return self._server.pid if self._server is not None else None
+        return self._server.state.pid if self._server is not None else None
 
     @property
-    def stamp(self) -> Installation | None:
+    def stamp(self) -> bytes | None:
         """The installation that the fork server loaded."""
-        return self._server.stamp if self._server is not None else None
+        return self._server.state.stamp if self._server is not None else None
 
     @property
     def refused(self) -> bool:
@@ -235,15 +171,13 @@ class ForkClient:
         return self._refused is not None
 
     @property
-    def state(self) -> tuple[ServerState | None, tuple[int, ...]]:
-        """The fork server, and the process ids of those before it, for :meth:`resume`."""
-        leaving = tuple(each.pid for each in self._leaving if not each.ended)
-        return self._server.state if self._server is not None and self._server.alive else None, leaving
+    def state(self) -> ServerState | None:
+        """The fork server, for :meth:`resume`."""
+        return self._server.state if self._server is not None and self._server.alive else None
 
-    def resume(self, server: ServerState | None, leaving: Sequence[int]) -> None:
+    def resume(self, server: ServerState | None) -> None:
         """Resume the fork server that the code before this one has started."""
-        self._server = _Server.resume(server) if server is not None else None
-        self._leaving = [_Adopted(pid) for pid in leaving]
+        self._server = _Server(server) if server is not None else None
 
     async def fork(
         self,
@@ -259,15 +193,20 @@ class ForkClient:
         channel: the gateway's end. content: of its file. take_over: descriptor of the socket by which it takes over.
         at_once: do not check whether the installation has changed.
         """
-        loop = asyncio.get_running_loop()
-        with _in_memory(content) as file:
+        with contextlib.ExitStack() as stack:
+            try:
+                file = stack.enter_context(in_memory("zbridge file", content))
+            except OSError as error:
+                raise NotReady(f"no memory for a file: {error.strerror or error}") from error
             descriptors = [channel.fileno(), file] if take_over is None else [channel.fileno(), file, take_over]
             async with self._turn:
-                checks = not at_once and loop.time() >= self._checked_at + CHECK_S
-                if checks or self._server is None or not self._server.alive:
-                    await self._renew()
-                assert self._server is not None
-                return await self._server.fork(request, descriptors)
+                checks = not at_once and asyncio.get_running_loop().time() >= self._checked_at + CHECK_S
+                return await (await self._running(checks=checks)).ask(request, descriptors)
+
+    async def rehearse(self, state: int) -> None:
+        """Let the fork server's code read a supervisor's state as in its place; raise NotReady with the reason."""
+        async with self._turn:
+            await (await self._running(checks=False)).ask(Rehearse(), [state])
 
     async def renew(self) -> None:
         """Start the fork server, or another one if the installation has changed; raise NotReady if there is none.
@@ -275,62 +214,46 @@ class ForkClient:
         A new one that does not start is reported, and the old one continues.
         """
         async with self._turn:
-            await self._renew()
+            await self._running(checks=True)
 
-    async def _renew(self) -> None:
+    async def _running(self, *, checks: bool) -> _Server:
+        """Return the fork server, started where there is none; checks: or where the installation has changed."""
+        old = self._server
+        if old is not None and old.alive and not checks:
+            return old
         self._checked_at = asyncio.get_running_loop().time()
-        self._leaving = [each for each in self._leaving if not each.ended]
-        old, stamp = self._server, await asyncio.to_thread(Installation)
+        stamp, settled = await asyncio.to_thread(installed)
         if old is not None and old.alive:
-            if stamp == old.stamp:
+            if stamp == old.state.stamp:
                 self._refused = None
-            self.unsettled = stamp != old.stamp and not stamp.settled
-            if stamp in (old.stamp, self._refused) or not stamp.settled:
-                return
+            self.unsettled = stamp != old.state.stamp and not settled
+            if stamp in (old.state.stamp, self._refused) or not settled:
+                return old
             log.info("the installed code has changed: loading it")
         try:
-            server = await _Server.start(self._command, stamp)
+            self._server, self._refused = await _Server.start(self._command, stamp), None
         except NotReady as error:
             if old is None or not old.alive:
                 raise
             self._refused = stamp
             log.error("%s: the old code continues", error)
-            return
-        self._server, self._refused = server, None
+            return old
         if old is not None:
-            old.close()
-            self._leaving.append(old)
+            old.kill()
+        return self._server
 
     def close(self) -> None:
-        for each in (self._server, *self._leaving):
-            if each is not None:
-                each.kill()
+        """End the fork server; idempotent."""
+        server, self._server = self._server, None
+        if server is not None:
+            server.kill()
 
 
-@contextlib.contextmanager
-def _in_memory(content: bytes) -> Iterator[int]:
-    """Write the content of a file to memory; give its descriptor. Raise NotReady if that is not possible."""
-    try:
-        descriptor = os.memfd_create("zbridge file")
-        try:
-            os.pwrite(descriptor, content, 0)  # memory takes all of it, or nothing
-        except OSError:
-            os.close(descriptor)
-            raise
-    except OSError as error:
-        raise NotReady(f"no memory for a file: {error.strerror or error}") from error
-    try:
-        yield descriptor
-    finally:
-        os.close(descriptor)
-
-
-def _spawned(command: Sequence[str]) -> tuple[subprocess.Popen[bytes], FdChannel]:
-    """Start a fork server, and give our end of its channel; raise OSError."""
+def _spawned(command: Sequence[str], stamp: bytes) -> ServerState:
+    """Start a fork server; raise OSError."""
     environment = {name: value for name, value in os.environ.items() if name not in NOT_INHERITED}
-    channel, far = FdChannel.pair()
-    with far, contextlib.ExitStack() as undo:
-        undo.callback(channel.close)
+    near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with near, far:
         process = subprocess.Popen(
             [*command, str(far.fileno())],
             pass_fds=[far.fileno()],
@@ -338,8 +261,8 @@ def _spawned(command: Sequence[str]) -> tuple[subprocess.Popen[bytes], FdChannel
             env={**environment, **ONE_THREAD},
             start_new_session=True,
         )
-        undo.pop_all()
-    return process, channel
+        process.returncode = 0  # it is waited for by its number
+        return ServerState(process.pid, near.detach(), stamp)
 
 
 def fork_server_command() -> list[str]:

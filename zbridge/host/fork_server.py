@@ -25,7 +25,9 @@ from typing import NoReturn
 import msgspec
 
 from zbridge.app.config import plan
-from zbridge.host.fd_channel import FdChannel, Fork, Forked, Ready, close_all
+from zbridge.errors import ZbridgeError, describe
+from zbridge.host.fd_channel import FdChannel, Fork, Forked, Ready, Rehearse, close_all
+from zbridge.host.replacement import restore
 from zbridge.protocol.plugin import find_protocol, protocol_names
 
 IMPORTED = ("numpy", "uvloop", "serial", "encodings.idna", "zbridge.bus.zenoh", "zbridge.app.gateway")
@@ -75,6 +77,8 @@ def serve(control: FdChannel, run: Run) -> None:
         request, descriptors = received
         if isinstance(request, Fork) and len(descriptors) > 1:
             control.send(_forked(control, request, descriptors, run))
+        elif isinstance(request, Rehearse) and descriptors:
+            control.send(_rehearsed(descriptors[0]))
         close_all(descriptors)
 
 
@@ -111,6 +115,17 @@ def _forked(control: FdChannel, request: Fork, descriptors: list[int], run: Run)
         pid = answer.read()
     os.waitpid(middle, 0)
     return Forked(int(pid)) if pid else Forked(0, "fork: the process in between failed")
+
+
+def _rehearsed(state: int) -> Forked:
+    """Do what the installed code does first in place of a supervisor."""
+    try:
+        import_module("zbridge.cli.supervise")
+        restore(state)
+    except Exception as error:  # whatever is wrong with the installed code
+        why = str(error) if isinstance(error, ZbridgeError) else describe(error)
+        return Forked(0, f"the installed code does not start: {why}")
+    return Forked(os.getpid())
 
 
 def _be_middle(writer: int, request: Fork, descriptors: list[int], run: Run) -> NoReturn:

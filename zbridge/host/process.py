@@ -190,31 +190,21 @@ class GatewayProcess:
 
     @property
     def state(self) -> ProcessState:
-        """What the code that takes the supervisor's place needs to resume, while the process is not over.
-
-        To be read while the deposit is the process's own.
-        """
-        deposit = self.deposit
-        return ProcessState(
-            self.pid,
-            self.channel.fileno(),
-            self._began,
-            self.watchdog,
-            deposit.last,
-            deposit.memory.descriptor if deposit.memory is not None else None,
-            self.hands_over,
-            deposit.deposited,
-            deposit.duplicates.state,
-        )
+        """What :meth:`resume` needs, while the process is not over, and its deposit is its own."""
+        deposit, links = self.deposit, tuple(self.deposit.duplicates)
+        reports: list[tuple[FromGateway, tuple[int, ...]]] = []
+        if deposit.memory is not None:
+            reports.append((Shared(), (deposit.memory.descriptor,)))
+        reports += [(Opened(each.link, each.name, each.drives), each.descriptors) for each in links]
+        heartbeat = Heartbeat(deposit.last, {each.link: each.boundary for each in links}, self.hands_over)
+        reports += [(deposit.deposited or Deposited(), ()), (heartbeat, ())]
+        return ProcessState(self.pid, self.channel.fileno(), self._began, self.watchdog, tuple(reports))
 
     def resume(self, state: ProcessState) -> None:
-        """Resume a process as the code before this one knew it."""
-        deposit = self.deposit
-        self._began, self.watchdog, deposit.last = state.began, state.watchdog, state.last
-        self.hands_over, deposit.deposited = state.hands_over, state.deposited
-        deposit.duplicates.resume(state.links)
-        if state.memory is not None:
-            deposit.share(state.memory)
+        """Receive again what the process had reported to the code before this one."""
+        for message, descriptors in state.reports:
+            self._handle(message, list(descriptors))
+        self._began, self.watchdog = state.began, state.watchdog
 
     def hand_deposit_to(self, successor: GatewayProcess) -> None:
         """Return a successor what this process deposited: it counts until the successor has made its own deposit."""

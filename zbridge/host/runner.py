@@ -86,6 +86,7 @@ class Runner:
         self._former: set[GatewayProcess] = set()
         """Those that have handed over or crashed, until they have ended."""
         self._tasks = Tasks()
+        self._restarting = Tasks()
         self._asked = asyncio.Event()
         """Set when the process asks for a successor."""
         self._settled = asyncio.Event()
@@ -99,9 +100,6 @@ class Runner:
         """Set to start the next process without waiting."""
         self._next_at: float | None = None
         """When the next process starts, while none runs."""
-        self._restarting = 0
-        self._waits = False
-        """Whether :meth:`run` waits for the end of the process, or for the time of the next."""
 
     def __repr__(self) -> str:
         return f"<Runner {self.file.robot} {self.process}>"
@@ -119,27 +117,18 @@ class Runner:
     @property
     def is_idle(self) -> bool:
         """Whether nothing is under way but a process that runs, or the wait for the next: :attr:`state` is all then."""
-        process = self.process
-        under_way = self._succession.processes or self._former or self._tasks or self._restarting or self._ending
-        if process is None:
-            return self._waits and not under_way and not self._now.is_set()
-        return self._waits and not under_way and not process.is_over and process.deposit.predecessor is None
+        if self._succession.processes or self._former or self._tasks or self._restarting or self._ending:
+            return False
+        if self.process is None:
+            return self._next_at is not None and not self._now.is_set()
+        return not self.process.is_over and self.process.deposit.predecessor is None
 
     @property
     def snapshot(self) -> RunnerState:
         """What :meth:`resume` needs, of a calm runner."""
-        file = self.file
-        return RunnerState(
-            str(file.path),
-            file.content,
-            file.identity,
-            self.restarts,
-            self._restart_delay.failures,
-            self._next_at,
-            self.process.state if self.process is not None else None,
-            tuple(file.forms),
-            file.shares,
-        )
+        file, process = self.file, self.process.state if self.process is not None else None
+        of_file = (str(file.path), file.content, file.identity, file.forms, file.shares)
+        return RunnerState(*of_file, self.restarts, self._restart_delay.failures, self._next_at, process)
 
     def resume(self, state: RunnerState) -> None:
         """Continue where the code before this one stopped; then call :meth:`run`."""
@@ -169,14 +158,11 @@ class Runner:
         self._ending = True
         self._now.set()
         await asyncio.gather(self._attended.wait(), *(self._end(process) for process in self.processes))
+        await self._restarting.end()
 
-    async def restart(self, file: RobotFile) -> None:
+    def restart(self, file: RobotFile) -> None:
         """Run by a changed file from now on: hand over where the process can, else end it and start another one."""
-        self._restarting += 1
-        try:
-            await self._restart(file)
-        finally:
-            self._restarting -= 1
+        self._restarting.start(self._restart(file))
 
     async def _restart(self, file: RobotFile) -> None:
         other = file.identity != self.file.identity
@@ -200,9 +186,7 @@ class Runner:
     async def _supervise(self) -> None:
         """Wait for the end of the process, and of those that follow it; stop the robot if it was no orderly one."""
         while (process := self.process) is not None:
-            self._waits = True
             how = await process.ended()
-            self._waits = False
             if process.succeeded:
                 if self._promote_successor(process):
                     continue
@@ -231,7 +215,7 @@ class Runner:
         if successor is None:
             await process.deposit.drain()
         elif successor.file.content != self.file.content:  # the file changed while the process died
-            self._tasks.start(self.restart(self.file))
+            self.restart(self.file)
         self._attended.set()
         return successor
 
@@ -309,11 +293,11 @@ class Runner:
         await self._wait_until(at)
 
     async def _wait_until(self, at: float) -> None:
-        self._next_at, self._waits = at, True
+        self._next_at = at
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(at - time.monotonic()):
                 await self._now.wait()
-        self._next_at, self._waits = None, False
+        self._next_at = None
         self._now.clear()
 
     # Handing over

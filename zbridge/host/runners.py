@@ -97,7 +97,7 @@ class Runners:
             self._running.start(self._leave(self.by_path.pop(path)))
         for file in changes.changed:
             log.info("%s: has changed", file.path)
-            self._running.start(self.by_path[file.path].restart(file))
+            self.by_path[file.path].restart(file)
         for path in [*changes.gone, *(file.path for file in (*changes.came, *changes.changed))]:
             self.faults.pop(path, None)
         for number, file in enumerate(changes.came):
@@ -112,9 +112,8 @@ class Runners:
     def resume(self, states: Iterable[RunnerState]) -> None:
         """Resume the robots of the code before this one."""
         for state in states:
-            forms = frozenset(state.forms)
-            file = RobotFile(Path(state.path), state.content, state.identity, forms=forms, shares=state.shares)
-            self._run(file, state)
+            file = RobotFile(Path(state.path), state.content, state.identity, forms=state.forms, shares=state.shares)
+            self._run(file).resume(state)
 
     def reap(self) -> None:
         """Note which processes have ended."""
@@ -142,11 +141,10 @@ class Runners:
         await asyncio.gather(*(runner.end() for runner in (*self.by_path.values(), *self._leaving)))
         await self._running.end()
 
-    def _run(self, file: RobotFile, state: RunnerState | None = None) -> None:
+    def _run(self, file: RobotFile) -> Runner:
         self.by_path[file.path] = runner = self._make(file)
-        if state is not None:
-            runner.resume(state)
         self._running.start(runner.run())
+        return runner
 
     async def _leave(self, runner: Runner) -> None:
         self._leaving.add(runner)

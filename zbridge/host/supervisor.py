@@ -13,20 +13,19 @@ import asyncio
 import contextlib
 import ctypes
 import logging
-import os
 import signal
 import time
-from collections.abc import Sequence
 from pathlib import Path
+
+import msgspec
 
 from zbridge.app.handover.processes import Systemd
 from zbridge.errors import ConfigError, HandoverError, NotReady
 from zbridge.host.files import Follower, RobotFile, compare, read_all
-from zbridge.host.fork_client import ForkClient, Installation
-from zbridge.host.replacement import VERSION, SupervisorState, quiet_threads, release_signals, replace
+from zbridge.host.fork_client import ForkClient, module_command
+from zbridge.host.replacement import SIGNALS, SupervisorState, quiet_threads, replace
 from zbridge.host.runner import Runner
 from zbridge.host.runners import Reports, Runners
-from zbridge.host.settings import HostSettings
 from zbridge.tasks import Tasks
 
 log = logging.getLogger("zbridge.host")
@@ -41,37 +40,23 @@ _PR_SET_CHILD_SUBREAPER = 36
 class Supervisor:
     """Runs the gateways of robot files.
 
-    host: how gateways run on this host. forks: starts their processes. itself: the command that continues in place of
-    this code. resumed: what the code before this one left.
+    state: what it runs, and, in place of other code, what that code knew. forks: starts the processes.
     """
 
-    def __init__(
-        self,
-        sources: tuple[Path, ...],
-        host: HostSettings,
-        forks: ForkClient,
-        *,
-        watch: bool,
-        verbose: bool,
-        itself: Sequence[str] = (),
-        resumed: SupervisorState | None = None,
-    ) -> None:
-        self._sources = sources
-        self._host = host
-        self._watch = watch
-        self._verbose = verbose
-        self._itself = itself
-        self._resumed = resumed
+    def __init__(self, state: SupervisorState, forks: ForkClient) -> None:
+        self._state = state
         self._forks = forks
         self._code = forks.stamp
         """The installation that this code is from."""
-        self._refused: Installation | None = None
+        self._refused: bytes | None = None
         """The installation whose code has not taken over."""
         self._forced = False
         """Set to replace this code though the installation is the same."""
-        self.runners = Runners(self._runner, self._state_changed, stagger_s=host.stagger_s)
-        self._reports = Reports(Systemd(), self.runners)
-        self._follower = Follower(sources, self.runners.faults, host.file_bytes)
+        self.runners = Runners(self._runner, self._state_changed, stagger_s=state.host.stagger_s)
+        self.runners.faults.update((Path(path), fault) for path, fault in state.faults.items())
+        self._reports = Reports(Systemd(), self.runners, is_ready=state.is_ready)
+        self._sources = tuple(map(Path, state.sources))
+        self._follower = Follower(self._sources, self.runners.faults, state.host.file_bytes)
         self._running = Tasks()
         self._timer: asyncio.TimerHandle | None = None
         self._reload = asyncio.Event()
@@ -87,15 +72,15 @@ class Supervisor:
         loop = asyncio.get_running_loop()
         loop.set_default_executor(quiet_threads())
         files: list[RobotFile] = []
-        if self._resumed is None:
-            files = await asyncio.to_thread(read_all, self._sources, self._host.file_bytes)
+        if self._state.at is None:
+            files = await asyncio.to_thread(read_all, self._sources, self._state.host.file_bytes)
         become_reaper()
         loop.add_signal_handler(signal.SIGCHLD, self.runners.reap)
         loop.add_signal_handler(signal.SIGHUP, self.reload)
         loop.add_signal_handler(signal.SIGUSR2, self.renew)
         try:
-            if self._resumed is not None:
-                self._resume(self._resumed)
+            if self._state.at is not None:
+                self._resume(self._state.at)
             else:
                 await self._start_forks()
             self._code = self._forks.stamp
@@ -136,14 +121,14 @@ class Supervisor:
         """Follow the files and the installation: at :meth:`reload`, and with ``watch`` every WATCH_S."""
         while True:
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(WATCH_S if self._watch or self._forks.unsettled else None):
+                async with asyncio.timeout(WATCH_S if self._state.watch or self._forks.unsettled else None):
                     await self._reload.wait()
             asked = self._reload.is_set()
             self._reload.clear()
             if asked:
                 self._reports.reloading(time.monotonic_ns() // 1000)
             try:
-                if asked or self._watch:
+                if asked or self._state.watch:
                     running = {path: runner.file for path, runner in self.runners.by_path.items()}
                     await self.runners.apply(await asyncio.to_thread(self._follower.poll, running, twice=not asked))
                 await self._forks.renew()
@@ -165,14 +150,18 @@ class Supervisor:
 
         asked: whether somebody asks, and an installation that has not taken over is tried again.
         """
-        stamp, forced, self._forced = self._forks.stamp, self._forced, False
-        if not forced and (stamp == self._code or (stamp == self._refused and not asked)):
+        stamp = self._forks.stamp
+        wanted = self._forced or (stamp != self._code and (asked or stamp != self._refused))
+        if not wanted or self._forks.unsettled:
             return
+        self._forced = False
         try:
             if self._forks.refused:
                 raise HandoverError("the installed code's fork server does not start")
-            await replace(self._itself, self.snapshot)
-        except HandoverError as error:
+            options = ["--watch"] * self._state.watch + ["--verbose"] * self._state.verbose  # for those who look
+            command = [*module_command("zbridge"), "run", *options, *self._state.sources]
+            await replace(command, self.snapshot, self._forks.rehearse)
+        except (HandoverError, NotReady, OSError, UnicodeError) as error:
             self._refused = stamp
             log.error("the supervisor continues with the old code: %s", error)
 
@@ -180,40 +169,31 @@ class Supervisor:
         """Return all that the code in place of this one needs; None while something is under way."""
         if not self.runners.is_idle:
             return None
-        server, leaving = self._forks.state
-        return SupervisorState(
-            VERSION,
-            tuple(map(str, self._sources)),
+        return msgspec.structs.replace(
+            self._state,
             at=time.monotonic(),
-            check_at=self.runners.check_at,
-            watch=self._watch,
-            verbose=self._verbose,
-            stagger_s=self._host.stagger_s,
-            file_bytes=self._host.file_bytes,
             is_ready=self._reports.is_ready,
             runners=tuple(runner.snapshot for runner in self.runners.by_path.values()),
-            server=server,
-            leaving=leaving,
+            server=self._forks.state,
             faults={str(path): fault for path, fault in self.runners.faults.items() if str(path).isprintable()},
         )
 
-    def _resume(self, state: SupervisorState) -> None:
-        """Resume where the code before this one was."""
-        for number in state.descriptors:
-            os.set_inheritable(number, False)
-        self._forks.resume(state.server, state.leaving)
-        self._reports.is_ready, self.runners.check_at = state.is_ready, state.check_at
-        self.runners.faults.update((Path(path), fault) for path, fault in state.faults.items())
-        self.runners.resume(state.runners)
-        release_signals()
-        taken_ms = (time.monotonic() - state.at) * 1000
+    def _resume(self, at: float) -> None:
+        """Resume where the code before this one was at this time."""
+        self._forks.resume(self._state.server)
+        self.runners.check_at = at  # this process has checked no watchdog since
+        self.runners.resume(self._state.runners)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+        taken_ms = (time.monotonic() - at) * 1000
         log.info("the installed code has taken over in %.0f ms: %s", taken_ms, self.runners.status)
 
     # Processes
 
     def _runner(self, file: RobotFile) -> Runner:
-        most_bytes = self._host.file_bytes
-        return Runner(file, self._forks, verbose=self._verbose, changed=self._state_changed, most_bytes=most_bytes)
+        state = self._state
+        return Runner(
+            file, self._forks, verbose=state.verbose, changed=self._state_changed, most_bytes=state.host.file_bytes
+        )
 
     def _state_changed(self) -> None:
         self._reports.changed()

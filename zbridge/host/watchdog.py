@@ -40,9 +40,9 @@ class Watchdog(msgspec.Struct):
     """The heartbeats of one process. last: of the last one, or of the start, in seconds of the monotonic clock."""
 
     last: float
-    timeout_s: float = msgspec.field(default=FIRST_S, name="patience_s")
-    extension_s: float = msgspec.field(default=0.0, name="excused_s")
-    heartbeats: int = msgspec.field(default=0, name="beats")
+    timeout_s: float = FIRST_S
+    extension_s: float = 0.0
+    heartbeats: int = 0
 
     def heartbeat(self, now: float, *, driven: bool) -> None:
         self.heartbeats += 1

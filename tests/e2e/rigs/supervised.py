@@ -24,7 +24,7 @@ from zbridge.cli.fork_server import run
 from zbridge.host.fd_channel import FdChannel
 from zbridge.host.fork_client import ForkClient
 from zbridge.host.fork_server import Birth, serve
-from zbridge.host.settings import HostSettings
+from zbridge.host.replacement import SupervisorState
 from zbridge.host.supervisor import Supervisor
 
 FORKS = "forks"
@@ -118,7 +118,7 @@ def main() -> None:
     folder = Path(sys.argv[1])
     orders_of(folder).mkdir(exist_ok=True)
     forks = module("tests.e2e.rigs.supervised", FORKS, orders_of(folder))
-    supervisor = Supervisor((folder,), HostSettings(), ForkClient(forks), watch=False, verbose=False)
+    supervisor = Supervisor(SupervisorState((str(folder),)), ForkClient(forks))
     asyncio.run(until_signal(supervisor.run()))
 
 

@@ -53,14 +53,16 @@ class Clock:
         self._over.set()
 
     def play(self, path: Path, selection: Selection | None = None, *, most: int = 10**6, **options: object) -> None:
-        def note(message):  # type: ignore[no-untyped-def]
+        def note(message, selected):  # type: ignore[no-untyped-def]
+            if not selected:
+                self.skipped.append(message.data)
+                return
             self.played.append((round(self.now - 100.0, 6), message.data))
             if len(self.played) >= most:
                 player._closing = True
 
         player = Player(
             *(path, selection or Selection(), note, self.end),
-            skip=lambda message: self.skipped.append(message.data),
             clock=lambda: self.now,
             sleep=self.sleep,
             **options,  # type: ignore[arg-type]

@@ -205,9 +205,8 @@ class LiveSource(ViewerSource):
                 for topic in _SWITCHES
             ]
         elif not self._watchers:
-            watching, self._watching = self._watching, []
-            for handle in watching:
-                handle.close()
+            while self._watching:
+                self._watching.pop().close()
 
     def _on_switch(self, sample: Sample) -> None:
         split = split_key(sample.key)

@@ -85,9 +85,8 @@ class BusCapture:
 
     def close(self) -> None:
         """Unsubscribe; idempotent."""
-        handles, self._handles = self._handles, []
-        for handle in handles:
-            handle.close()
+        while self._handles:
+            self._handles.pop().close()
         for task in (*self._querying.values(), *((self._sessions,) if self._sessions else ())):
             task.cancel()
         self._querying.clear()

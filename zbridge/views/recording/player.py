@@ -73,20 +73,19 @@ class PlaybackClock:
 
 
 class Player:
-    """Plays a file from :meth:`start` to its end or :meth:`close`. play: called on the player's thread.
+    """Plays a file from :meth:`start` to its end or :meth:`close`.
 
-    ended: called there at the end, with what is wrong with the file, or None. skip: called with what precedes the
-    selected part.
+    play: called on the player's thread with a message, and whether it is selected: those before the selected part are
+    not due. ended: called there at the end, with what is wrong with the file, or None.
     """
 
     def __init__(
         self,
         path: Path,
         selection: Selection,
-        play: Callable[[RecordedMessage], object],
+        play: Callable[[RecordedMessage, bool], object],
         ended: Callable[[str | None], object],
         *,
-        skip: Callable[[RecordedMessage], object] = lambda message: None,
         speed: float = 1.0,
         loop: bool = False,
         clock: Callable[[], float] = time.monotonic,
@@ -97,7 +96,6 @@ class Player:
         self._selection = selection
         self._play = play
         self._ended = ended
-        self._skip = skip
         self._time = PlaybackClock(0, 2**64)
         self._speed = speed
         self._loop = loop
@@ -158,7 +156,7 @@ class Player:
                     return None
                 if not self._selection.includes(message):
                     if message.log_ns < self._selection.since_ns:
-                        self._skip(message)
+                        self._play(message, False)
                     continue
                 if not begun:
                     begun = True
@@ -166,7 +164,7 @@ class Player:
                         self._time.seek(message.log_ns, self._clock())
                 if not self._wait(message.log_ns):
                     return None
-                self._play(message)
+                self._play(message, True)
                 self.played += 1
         return None if reader.ended else reader.fault
 

@@ -144,9 +144,7 @@ class Replay:
         self._loop = asyncio.get_running_loop()
         self._earlier: dict[str, RecordedMessage] = {}
         self._targets: dict[str, tuple[ReplayedRobot, str] | None] = {}
-        self.player = Player(
-            plan.path, plan.selection, self._play, self._on_end, speed=plan.speed, loop=plan.loop, skip=self._skip
-        )
+        self.player = Player(plan.path, plan.selection, self._play, self._on_end, speed=plan.speed, loop=plan.loop)
         if plan.paused:
             self.player.pause()
 
@@ -200,7 +198,10 @@ class Replay:
         if topic is not None and topic.delivery is Delivery.STATE and len(self._earlier) < KEYS:
             self._earlier[message.channel.topic] = message
 
-    def _play(self, message: RecordedMessage) -> None:
+    def _play(self, message: RecordedMessage, selected: bool) -> None:
+        if not selected:
+            self._skip(message)
+            return
         earlier, self._earlier = self._earlier, {}
         for state in earlier.values():
             self._play_now(state)

@@ -48,9 +48,8 @@ class Services:
 
     def close(self) -> None:
         """Take the services back; idempotent. Calls that are on their way end unanswered."""
-        handles, self._handles = self._handles, []
-        for handle in handles:
-            handle.close()
+        while self._handles:
+            self._handles.pop().close()
         self._tasks.cancel()
 
     def _serve(self, node: Node, name: str, type_name: str, work: Work) -> None:

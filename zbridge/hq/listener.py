@@ -104,7 +104,7 @@ class Listener:
         self._broadcast.begin()
         async with listen(
             self.address,
-            lambda: Accepted(self._admit, logging.DEBUG),  # the end of a client is logged with its reason
+            lambda: Accepted(self._admit),
             datagrams=self._context.side.datagrams,
             foreign=self._context.counts.foreign_datagrams,
             secured=self._secured,

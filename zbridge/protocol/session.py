@@ -64,8 +64,6 @@ class Session(KeptSession, ABC, Generic[M]):
     frame_end: FrameEnd
     handled: frozenset[type] = frozenset()
     """Message classes that go to ``accept`` after the handshake too."""
-    drops_source = False
-    """Set by a protocol when the source of datagrams is not the peer; the driver forgets the source and clears it."""
 
     def __init__(self, limits: Limits, *, name: str = "", peer: str = "") -> None:
         self.limits = limits
@@ -110,16 +108,6 @@ class Session(KeptSession, ABC, Generic[M]):
     def accept(self, message: M, now: float) -> bool:
         """Handle a message of the handshake, or of a class in ``handled``; True hands it on to the translator."""
 
-    def claims(self, datagram: bytes, port: int) -> bool:
-        """Tell whether a datagram from a port of the peer's host that is nobody's source yet is from the peer."""
-        return False
-
-    def rivalled(self, now: float) -> None:
-        """React to a second source, or session, with the same claim; the peer has no source of datagrams any more."""
-
-    def stray(self, datagram: bytes) -> None:
-        """Look at a datagram of the peer's host that nobody claimed; raise Refused to tell the peer why."""
-
     def timers(self) -> float:
         """Give the time of the next :meth:`on_timer`; ``inf``: never."""
         return math.inf
@@ -149,7 +137,7 @@ class Session(KeptSession, ABC, Generic[M]):
             return messages
         traffic, decode, tap, handled = self.traffic, self.decode, self.tap, self.handled
         traffic.bytes_in += len(data)
-        frames, allowed = 0, self._allowance.fill(now)
+        frames, allowed = 0, self._allowance.fill(now) if self._allowance.rate_hz < math.inf else math.inf
         try:
             for frame in self._frames.feed(data):
                 frames += 1

@@ -21,7 +21,7 @@ from zbridge.protocol.kept import Budget, Exported
 from zbridge.protocol.session import Session, State
 from zbridge.protocol.session_table import Backoff, SessionTable
 from zbridge.robot.wire_tap import WireTap
-from zbridge.transport import Conversation, Link, Parcel, attach
+from zbridge.transport import Conversation, ConversationHooks, Link, Parcel, attach
 from zbridge.transport.fair_share import FairShare
 
 log = logging.getLogger("zbridge.link")
@@ -51,18 +51,18 @@ class Hooks(msgspec.Struct, frozen=True):
     manager: SessionTable
     malformed: Count
     foreign: Count
+    surplus: Count
+    """Counts datagrams beyond the share."""
     clock: Callable[[], float]
     before: Callable[[], object] = lambda: None
     """Called before a frame is written: a stop may have to be written first."""
     share: FairShare | None = None
     """Of the processor, where the process serves other robots too."""
-    surplus: Count | None = None
-    """Counts datagrams beyond the share."""
     stalled: Callable[[bool], object] = lambda stalled: None
     """Called when the link stops taking bytes (True), and when it takes them again (False)."""
     linked: Callable[[Link, bool], object] = lambda link, up: None
     """Called when a link is up (True), and when it is gone (False)."""
-    read: Callable[[], object] = lambda: None
+    read: Callable[[], object] | None = None
     """Called when the bytes of a read have been handled."""
     attach: Attach = attach
     chance: Callable[[], float] = random.random
@@ -106,13 +106,13 @@ class Links:
         """Read nothing until :meth:`resume_reading`."""
         for connection in self._connections:
             if connection.conversation is not None:
-                connection.conversation.pause_reading()
+                connection.conversation.reading.pause()
 
     def resume_reading(self) -> None:
         """Read again."""
         for connection in self._connections:
             if connection.conversation is not None:
-                connection.conversation.resume_reading()
+                connection.conversation.reading.resume()
 
 
 class Connection:
@@ -225,7 +225,7 @@ class Connection:
         session.restore(state["session"])
         self.state, self.reason = _STATES[session.state], session.busy or session.reason
         self.conversation = conversation = self._make_conversation(session)
-        conversation.suspended, conversation.connected_at = True, state["connected_at"]
+        conversation.reading.suspended, conversation.connected_at = True, state["connected_at"]
         self._restored = (state["link"], parcel)
 
     def detach(self) -> None:
@@ -269,9 +269,7 @@ class Connection:
         session.name = self.name
         session.outbox.mute(self._muted)
         self._wire.begin(session)
-        return Conversation(
-            session,
-            asyncio.get_running_loop(),
+        talk = ConversationHooks(
             deliver=hooks.deliver,
             changed=lambda: self._on_session(session),
             malformed=hooks.malformed,
@@ -284,6 +282,7 @@ class Connection:
             linked=hooks.linked,
             read=hooks.read,
         )
+        return Conversation(session, asyncio.get_running_loop(), talk)
 
     def _on_session(self, session: Session[Any]) -> None:
         if session.state is State.ESTABLISHED and self.state != "established":

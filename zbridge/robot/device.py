@@ -299,7 +299,8 @@ class Device(Transferable):
             return Standing(record=record)
         established = session.state is State.ESTABLISHED and session.doubtful is None
         healthy = established and not talk.stalled and talk.unheard_s <= HEARD_S
-        return Standing(healthy, talk.connected_s, record)
+        connected_s = self._context.clock() - talk.connected_at if talk.link and talk.connected_at is not None else 0.0
+        return Standing(healthy, connected_s, record)
 
     @property
     def must_stay(self) -> bool:

@@ -21,7 +21,7 @@ from zbridge.protocol.kept import Exported
 from zbridge.transport.backlog import Backlog
 from zbridge.transport.door import Door, make_link
 from zbridge.transport.kernel import KERNEL, Kernel
-from zbridge.transport.link import NOBODY, STALLED_S, Receiver
+from zbridge.transport.link import STALLED_S, Link, Receiver, unwatched
 from zbridge.transport.tcp_options import KEEPALIVE_S, bound_retries, keep_alive, new_backlog, outstanding, tune
 from zbridge.transport.transferable import Parcel
 from zbridge.transport.udp import DatagramHub, DatagramSocket
@@ -48,17 +48,16 @@ CONNECT_S = 5.0
 """Seconds that a connection attempt may take."""
 
 
-def _unwatched() -> None:
-    """Do nothing: nobody watches the reads of the link."""
-
-
-class TcpLink(asyncio.BufferedProtocol):
+class TcpLink(asyncio.BufferedProtocol, Link):
     """A TCP connection. ``hub``: the listener's UDP socket, if the peer was accepted there.
 
     ``buffer``: where reads go, :data:`READ_BYTES` of its own by default. Reads are copied at once, so all links of a
     loop may share it. ``accepted``: by a listener. ``restored_udp``: the socket for datagrams to a robot, where another
     process handed the connection over.
     """
+
+    ready = False
+    """Whether the kernel took all that was written."""
 
     def __init__(
         self,
@@ -70,18 +69,15 @@ class TcpLink(asyncio.BufferedProtocol):
         restored_udp: socket.socket | None = None,
         kernel: Kernel = KERNEL,
     ) -> None:
+        super().__init__(receiver)
         self._kernel = kernel
-        self.peer = ""
-        self.reads: Callable[[], object] = _unwatched
         self._restored_udp = restored_udp
         self._backlog: Backlog | None = None
         self._hub = hub
         self._accepted = accepted
         self._datagrams: DatagramSocket | None = None
-        self._receiver = receiver
         self._transport: asyncio.Transport | None = None
         self._view = memoryview(bytearray(READ_BYTES) if buffer is None else buffer)
-        self._held_back = False
 
     def __repr__(self) -> str:
         return f"<TcpLink {self.peer or 'unconnected'}>"
@@ -94,11 +90,6 @@ class TcpLink(asyncio.BufferedProtocol):
         stream: int = self._transport.get_extra_info("socket").fileno()
         datagrams = self._datagrams.fileno() if self._datagrams is not None else -1
         return tuple(number for number in (stream, datagrams) if number >= 0)
-
-    @property
-    def ready(self) -> bool:
-        """Whether the kernel took all that was written."""
-        return self._transport is not None and not self._held_back
 
     def write(self, data: bytes) -> None:
         """Write ``data`` as one segment."""
@@ -118,7 +109,7 @@ class TcpLink(asyncio.BufferedProtocol):
         elif self._transport is not None:
             if self._datagrams is None:
                 try:
-                    self._datagrams = DatagramSocket(self._transport, self._receiver, kernel=self._kernel)
+                    self._datagrams = DatagramSocket(self._transport, self, kernel=self._kernel)
                 except OSError as error:  # no descriptor, no port: the datagram is lost, the next one tries again
                     log.warning("%s: no socket for datagrams: %s", self.peer, error)
                     return
@@ -189,7 +180,7 @@ class TcpLink(asyncio.BufferedProtocol):
 
     def detach(self) -> None:
         """Give up the own descriptors of a connection that another process has now: no FIN is sent."""
-        self._receiver = NOBODY
+        self.receiver = Receiver()
         self.abort()
 
     def close(self) -> None:
@@ -197,7 +188,7 @@ class TcpLink(asyncio.BufferedProtocol):
         transport = self._transport
         if transport is not None and not transport.is_closing():
             transport.close()
-            if self._held_back:
+            if not self.ready:
                 asyncio.get_running_loop().call_later(CLOSE_S, self.abort)
 
     def abort(self) -> None:
@@ -207,11 +198,9 @@ class TcpLink(asyncio.BufferedProtocol):
 
     # What asyncio calls
 
-    async def ended(self) -> None:
-        """Return at once: such a link has no threads."""
-
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast(asyncio.Transport, transport)  # uvloop's transport does not inherit from it
+        self.ready = True
         self._transport.set_write_buffer_limits(high=0)  # makes uvloop write at once, not at the end of its iteration
         peer = transport.get_extra_info("peername")
         if peer is None:  # already reset; connection_lost follows
@@ -227,11 +216,11 @@ class TcpLink(asyncio.BufferedProtocol):
             bound_retries(sock)
             self._backlog = new_backlog(sock, self._kernel)
             if self._restored_udp is not None:
-                self._datagrams = DatagramSocket(self._transport, self._receiver, self._restored_udp, self._kernel)
+                self._datagrams = DatagramSocket(self._transport, self, self._restored_udp, self._kernel)
                 self._datagrams.resume()
         if self._hub is not None:
-            self._hub.add(self, peer[0], self._receiver)
-        self._receiver.attached(self)
+            self._hub.add(self, peer[0])
+        self.receiver.attached(self)
 
     def get_buffer(self, sizehint: int) -> memoryview:
         self.reads()
@@ -241,31 +230,31 @@ class TcpLink(asyncio.BufferedProtocol):
         data = bytes(self._view[:nbytes])
         if self._hub is not None:
             self._hub.drain()  # datagrams that wait are older: an old drive must not follow a newer stop
-        self._receiver.received(data)
-        if nbytes == len(self._view) and self.reads is not _unwatched:
+        self.receiver.received(data)
+        if nbytes == len(self._view) and self.reads is not unwatched:
             # libuv reads once more, often in vain: who watches the reads must learn that nothing was taken.
             asyncio.get_running_loop().call_soon(self._read_in_vain)
 
     def _read_in_vain(self) -> None:
-        self._receiver.received(b"")
+        self.receiver.received(b"")
 
     def eof_received(self) -> bool:
         return False
 
     def pause_writing(self) -> None:
-        self._held_back = True
+        self.ready = False
 
     def resume_writing(self) -> None:
-        self._held_back = False
-        self._receiver.writable()
+        self.ready = self._transport is not None
+        self.receiver.writable()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._transport = None
+        self._transport, self.ready = None, False
         if self._datagrams is not None:
             self._datagrams.close()
         if self._hub is not None:
             self._hub.remove(self)
-        self._receiver.lost(f"connection lost: {exc}" if exc else "closed by peer")
+        self.receiver.lost(f"connection lost: {exc}" if exc else "closed by peer")
 
 
 async def connect(

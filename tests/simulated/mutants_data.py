@@ -62,18 +62,18 @@ MUTANTS = (
         "if False:",
     ),
     Mutant(
-        "hold-back forgotten",
+        "required neutral forgotten",
         None,
         AUTHORITY,
-        "        if self._held_back is not None:\n            raise NeutralFirst",
+        "        if self._needs_neutral is not None:\n            raise NeutralFirst",
         "        if False:\n            raise NeutralFirst",
     ),
     Mutant(
-        "hold-back ends with motion",
+        "required neutral ends with motion",
         None,
         AUTHORITY,
-        "        self._still()\n        self._held_back = cause.reason\n",
-        "        self._still()\n        self._held_back = None\n",
+        "        self._still()\n        self._needs_neutral = cause.reason\n",
+        "        self._still()\n        self._needs_neutral = None\n",
     ),
     # the lease: expiry, token, proof
     Mutant(
@@ -242,7 +242,7 @@ MUTANTS = (
         "drives wait for a stalled link for ever",
         "situations",
         PRESENCE,
-        '            self._enforcer.hold_back("the robot\'s link took nothing", stops=True)',
+        '            self._enforcer.require_neutral("the robot\'s link took nothing", stops=True)',
         "            pass",
     ),
     Mutant(
@@ -282,7 +282,7 @@ MUTANTS = (
         "if False:",
     ),
     Mutant(
-        "a yielded gateway goes on",
+        "a yielded gateway continues",
         "ownership",
         "zbridge/app/serving.py",
         "        await self._device.step_aside()\n",
@@ -401,7 +401,7 @@ MUTANTS = (
     ),
     Mutant("old neutral counts at once", "situations", INTENT, "        if self._waited:\n", "        if False:\n"),
     Mutant(  # both: what was queued meanwhile takes the robot from its program too
-        "a frozen listener goes on",
+        "a frozen listener continues",
         "situations",
         "zbridge/hq/freeze.py",
         "        if frozen_s >= FROZEN_S:",

@@ -6,14 +6,14 @@ nothing. An action that raises Refused has changed nothing, and the state stays.
 
 States. FREE and STOPPED: nobody has the lease (they differ in what people are shown). HELD: a program has the lease
 and no motion is commanded. MOVING: the last command for at least one part of the robot was motion; the deadman runs.
-HELD_BACK: a program has the lease and must send neutral before motion. LATCHED: a latched stop is in force; nobody has
-the lease, and nobody gets it.
+NEEDS_NEUTRAL: a program has the lease and must send neutral before motion. LATCHED: a latched stop is in force; nobody
+has the lease, and nobody gets it.
 
 Who calls what. The lease server calls :meth:`acquire`, :meth:`takeover`, :meth:`renew` and :meth:`release` for queries,
 and :meth:`vanished` for lost liveliness tokens. The enforcer calls :meth:`admit` for each command that needs the lease,
 :meth:`require_motion` if the command is motion, :meth:`applied` after the robot was sent it, :meth:`stop`,
-:meth:`hold_back`, and :meth:`expire` at :meth:`deadline`. After each call it takes :meth:`events`, writes each down,
-and sends the robot its stop at once for one that ``stops``. The admission filters read :attr:`verifier` and
+:meth:`require_neutral`, and :meth:`expire` at :meth:`deadline`. After each call it takes :meth:`events`, writes each
+down, and sends the robot its stop at once for one that ``stops``. The admission filters read :attr:`verifier` and
 :attr:`moving` from the bus's threads; all else is for the event loop's thread.
 
 Guarantees. Questions about the lease and :meth:`admit` do first what is due by then. Commanded motion always has a
@@ -85,9 +85,9 @@ class Authority:
         self._deadman_s = deadman_s
         """The deadman of the current holder."""
         self._stop_at = math.inf
-        self._held_back: str | None = None
+        self._needs_neutral: str | None = None
         self._moved: set[str] = set()
-        """The parts that moved when the robot was held back, and whose neutral has not come yet."""
+        """The parts that moved when neutral was required, and whose neutral has not come yet."""
         self._refusals = RefusalCounts()
         self._events: list[Event] = []
 
@@ -157,21 +157,21 @@ class Authority:
 
     def require_motion(self) -> None:
         """Raise Refused if the holder must send neutral before the robot moves."""
-        if self._held_back is not None:
-            raise NeutralFirst(f"{self._held_back}: send a neutral drive first")
+        if self._needs_neutral is not None:
+            raise NeutralFirst(f"{self._needs_neutral}: send a neutral drive first")
 
     def applied(self, part: str, given_at: float, *, moving: bool, stale: bool = False, whole: bool = False) -> None:
         """Record that the holder's command for one part of the robot was carried out.
 
         given_at: when it was given, on the time line of ``now``; the deadman counts from then. A stale neutral ends
-        motion and does not allow it again. whole: a neutral counts for all parts; else a robot that was held back waits
-        for the neutral of each part that moved.
+        motion and does not allow it again. whole: a neutral counts for all parts; else a required
+        neutral must come for each part that moved.
         """
         parts = self._moving
         if moving and part in parts:  # repeated motion is no input: it only postpones the deadman
             self._stop_at = given_at + self._deadman_s
             return
-        if not moving and not parts and self._held_back is None:  # nor is repeated neutral
+        if not moving and not parts and self._needs_neutral is None:  # nor is repeated neutral
             self._autonomous = False
             return
         if not moving and not stale and self._moved:
@@ -253,9 +253,9 @@ class Authority:
         """The ids of the last stops: what repeats one of them changes nothing. Read by other threads."""
         return frozenset(self._stops)
 
-    def hold_back(self, reason: str, *, stops: bool = True) -> None:
+    def require_neutral(self, reason: str, *, stops: bool = True) -> None:
         """Stop the robot, or (``stops=False``) record that it is stopped; motion needs a neutral first."""
-        self._handle(Input.HOLD_BACK, Cause(reason=reason, stops=stops))
+        self._handle(Input.REQUIRE_NEUTRAL, Cause(reason=reason, stops=stops))
 
     def vanished(self, alive: str) -> None:
         """Record that a liveliness token is gone; if the holder named it, the lease ends."""
@@ -340,7 +340,7 @@ class Authority:
         if self._holders.current is not None:
             self._end(Cause(reason=f"taken over by {who}"))
         elif self.moving:
-            self._hold_back(Cause(reason=f"moving for nobody when {who} acquired"))
+            self._require_neutral(Cause(reason=f"moving for nobody when {who} acquired"))
         lease, token = self._holders.new_lease()
         self.verifier, self._deadman_s = Verifier(lease, token), deadman_s
         age = CommandAge(min(self._max_age_s, deadman_s) if self._max_age_s < math.inf else math.inf)
@@ -349,7 +349,7 @@ class Authority:
         self._holders.current = Holder(
             who, request.priority, self.verifier, lease_s, request.alive, expires_at, age, request.t
         )
-        self._held_back = None
+        self._needs_neutral = None
         self._moved.clear()
         self._events.append(Event(cause.kind, who, priority=request.priority))
         max_age_s = age.limit_s if request.t is not UNSET and age.limit_s < math.inf else UNSET
@@ -390,28 +390,28 @@ class Authority:
     def _rest(self, cause: Cause) -> None:
         """Stop the deadman; neutral also takes the robot out of its mode, and allows motion again."""
         self._rest_stale(cause)
-        self._held_back = None
+        self._needs_neutral = None
 
     def _rest_stale(self, cause: Cause) -> None:
         """Stop the deadman; neutral also takes the robot out of its mode."""
         self._autonomous = False
         self._stop_at = math.inf
 
-    def _hold_back(self, cause: Cause) -> None:
+    def _require_neutral(self, cause: Cause) -> None:
         """Require neutral before motion; report it once for each reason, and always with a stop."""
-        if cause.stops or self.moving or self._held_back != cause.reason:
+        if cause.stops or self.moving or self._needs_neutral != cause.reason:
             who = self._holders.current.who if self._holders.current else None
             self._events.append(Event(EventKind.STOPPED, who, cause.reason, stops=cause.stops))
         self._moved |= self._moving
         self._still()
-        self._held_back = cause.reason
+        self._needs_neutral = cause.reason
 
     def _end(self, cause: Cause) -> None:
         """End the lease, if there is one, and stop the robot if it moves, or if that was asked for."""
         stops = cause.kind in (EventKind.STOPPED, EventKind.LATCHED) or self.moving
         holder, self.verifier = self._holders.end(cause.reason), None
         self._still()
-        self._held_back = None
+        self._needs_neutral = None
         self._moved.clear()
         self._deadman_s = self.deadman_s
         who = cause.who if cause.kind is EventKind.LATCHED else holder.who if holder else None
@@ -437,8 +437,8 @@ class Authority:
         Input.MOTION: (_move, None),
         Input.NEUTRAL: (_rest, None),
         Input.STALE_NEUTRAL: (_rest_stale, None),
-        Input.DEADMAN: (_hold_back, None),
-        Input.HOLD_BACK: (_hold_back, None),
+        Input.DEADMAN: (_require_neutral, None),
+        Input.REQUIRE_NEUTRAL: (_require_neutral, None),
         Input.STOP: (_end, State.STOPPED),
         Input.LATCH: (_end, State.LATCHED),
     }
@@ -451,7 +451,7 @@ class Authority:
         Input.RELEASE: (_give_back, State.FREE),
         Input.NEUTRAL: (_rest, State.HELD),
         Input.STALE_NEUTRAL: (_rest_stale, State.HELD),
-        Input.HOLD_BACK: (_hold_back, State.HELD_BACK),
+        Input.REQUIRE_NEUTRAL: (_require_neutral, State.NEEDS_NEUTRAL),
         Input.STOP: (_end, State.STOPPED),
         Input.LATCH: (_end, State.LATCHED),
         Input.EXPIRED: (_end, State.STOPPED),
@@ -462,12 +462,12 @@ class Authority:
         State.FREE: _NOBODY,
         State.STOPPED: _NOBODY,
         State.HELD: _HOLDER | {Input.MOTION: (_move, State.MOVING)},
-        State.MOVING: _HOLDER | {Input.MOTION: (_move, None), Input.DEADMAN: (_hold_back, State.HELD_BACK)},
-        State.HELD_BACK: _HOLDER
+        State.MOVING: _HOLDER | {Input.MOTION: (_move, None), Input.DEADMAN: (_require_neutral, State.NEEDS_NEUTRAL)},
+        State.NEEDS_NEUTRAL: _HOLDER
         | {
             Input.MOTION: (_move, None),
             Input.STALE_NEUTRAL: (_rest_stale, None),
-            Input.DEADMAN: (_hold_back, None),
+            Input.DEADMAN: (_require_neutral, None),
         },
         State.LATCHED: _NOBODY
         | {
@@ -487,4 +487,4 @@ _MOTION, _NEUTRAL, _STALE_NEUTRAL = (
     Input.STALE_NEUTRAL,
 )  # looking up a member of an enum costs more than a command may
 _ANOTHER_GATEWAY = "another gateway of the robot"
-_SHOWN = {State.MOVING: "held", State.HELD_BACK: "held"}
+_SHOWN = {State.MOVING: "held", State.NEEDS_NEUTRAL: "held"}

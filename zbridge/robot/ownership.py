@@ -92,7 +92,7 @@ class Served(Protocol):
         """Take what a gateway knows that does not serve the robot."""
 
     async def step_aside(self) -> None:
-        """Leave the robot to another gateway, and stay connected."""
+        """Leave the robot to another gateway: stop it, then publish, write and connect nothing."""
 
     async def step_in(self) -> None:
         """Serve the robot again."""
@@ -194,7 +194,7 @@ class Ownership:
             await asyncio.sleep(LOOK_S)
 
     async def watch(self, served: Served) -> None:
-        """Look for other gateways that serve the robot; return when the robot must be left to one of them."""
+        """ReadPayload for other gateways that serve the robot; return when the robot must be left to one of them."""
         self._standing, self._merge = lambda: served.standing, served.merge
         if self._state is OwnershipState.YIELDED:
             await served.step_aside()
@@ -224,6 +224,7 @@ class Ownership:
         if found is OwnershipInput.OUTBID and self._keeps_latches(own):
             return state
         if self._handle(found) is OwnershipState.LOOKING:
+            await served.step_aside()
             return self._state
         if self._state is not state:
             log.error("%s: %s", self._keys.robot, _TURNS[self._state])
@@ -354,7 +355,7 @@ class Ownership:
         self._asked.clear()
 
     async def _sees(self, others: OtherGateways) -> bool:
-        """Look for a token, and for the claim behind it."""
+        """ReadPayload for a token, and for the claim behind it."""
         token = bool(await self._bus.alive(self._keys.alive(_WHO)))
         claims = await self._claims() if token else {}
         serving = [claim for claim in claims.values() if claim.held_s]

@@ -190,7 +190,7 @@ class Conversation(Receiver):
         self.session.lost(reason)
 
     def writable(self) -> None:
-        """Go on writing."""
+        """Resume writing."""
         self.pump()
 
     def pump(self) -> None:
@@ -295,7 +295,7 @@ class Conversation(Receiver):
             self.link.suspend()
 
     def resume(self) -> None:
-        """Go on where :meth:`suspend` interrupted: this process has the connection."""
+        """Continue where :meth:`suspend` interrupted: this process has the connection."""
         self.reading.suspended = False
         if self.link is not None:
             self.link.resume()

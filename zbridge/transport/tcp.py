@@ -37,7 +37,7 @@ CLIENT_READ_BYTES = 4096
 CLIENT_WRITE_BYTES = 64 * 1024
 """Bytes that the kernel keeps for an accepted peer that reads slowly; older ones are of no use."""
 GIVE_UP_S = 60.0
-"""Seconds without acknowledgement after which a robot's connection ends: long, for a deployed robot gives only one."""
+"""Seconds without acknowledgement after which a robot's connection ends: long, for a legacy robot gives only one."""
 CLIENT_GIVE_UP_S = 10.0
 """The same for an accepted peer."""
 _TCP_INFO = struct.Struct("=24xI28xI")

@@ -152,7 +152,7 @@ class TlsLink(Link, Receiver):
         self.receiver.lost(self._why or reason)
 
     def writable(self) -> None:
-        """Go on writing."""
+        """Resume writing."""
         if self._open:
             self.receiver.writable()
 

@@ -101,9 +101,9 @@ class RobotContext(msgspec.Struct, frozen=True):
     metrics: Metrics
     conditions: Conditions
     faults: Faults
-    publish: Callable[[Topic, FleetMessage], object]
-    pump: Callable[[], object]
     clock: Callable[[], float]
-    clock_ns: Callable[[], int]
+    clock_ns: Callable[[], int] = time.time_ns
     raw_ms: Callable[[], float] = raw_ms
     suspended_s: Callable[[], float] = suspended_s
+    publish: Callable[[Topic, FleetMessage], object] = lambda topic, message: None
+    pump: Callable[[], object] = lambda: None

@@ -194,7 +194,7 @@ class Ownership:
             await asyncio.sleep(LOOK_S)
 
     async def watch(self, served: Served) -> None:
-        """ReadPayload for other gateways that serve the robot; return when the robot must be left to one of them."""
+        """Look for other gateways that serve the robot; return when the robot must be left to one of them."""
         self._standing, self._merge = lambda: served.standing, served.merge
         if self._state is OwnershipState.YIELDED:
             await served.step_aside()
@@ -355,7 +355,7 @@ class Ownership:
         self._asked.clear()
 
     async def _sees(self, others: OtherGateways) -> bool:
-        """ReadPayload for a token, and for the claim behind it."""
+        """Look for a token, and for the claim behind it."""
         token = bool(await self._bus.alive(self._keys.alive(_WHO)))
         claims = await self._claims() if token else {}
         serving = [claim for claim in claims.values() if claim.held_s]

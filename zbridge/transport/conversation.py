@@ -116,7 +116,8 @@ class Conversation(Receiver):
         self._blocked = False
         """Whether nothing is written because the link is stalled."""
         self.reading = Reading(loop, clock, hooks.share)
-        self._heard_at = -math.inf
+        self.heard_at = -math.inf
+        """When anything came by the link last, or it came up."""
 
     def __repr__(self) -> str:
         return f"<Conversation {self.session!r}>"
@@ -125,9 +126,9 @@ class Conversation(Receiver):
     def attached(self, link: Link) -> None:
         """Begin: the link is up."""
         self.link = self._observed = self.reading.link = link
-        self._heard_at = self._clock()
+        self.heard_at = self._clock()
         if self.connected_at is None:
-            self.connected_at = self._heard_at
+            self.connected_at = self.heard_at
         self._hooks.linked(link, True)
         if self.reading.suspended:
             link.suspend()
@@ -136,7 +137,7 @@ class Conversation(Receiver):
 
     def received(self, data: bytes) -> None:
         """Take bytes from the link."""
-        begun = self._heard_at = self._clock()
+        begun = self.heard_at = self._clock()
         try:
             self._before()
             messages = self.session.receive(data, begun)
@@ -153,7 +154,7 @@ class Conversation(Receiver):
     @then_pump
     def received_datagram(self, datagram: bytes) -> None:
         """Take a datagram from the link."""
-        begun = self._heard_at = self._clock()
+        begun = self.heard_at = self._clock()
         if self.reading.rests:
             self._hooks.surplus.value += 1
             return
@@ -170,8 +171,14 @@ class Conversation(Receiver):
             self._notify()
         if messages:  # the messages before the end of a session are delivered before the end is reported
             self._hooks.deliver(messages)
-        if self.session.traffic.malformed != self._malformed_logged:
-            self._report_malformed()
+        count, logged = self.session.traffic.malformed, self._malformed_logged
+        if count == logged:
+            return
+        self._hooks.malformed.value += count - logged
+        # a warning at malformed messages 1, 2, 4, 8 ...: the log stays readable in a flood
+        if count.bit_length() != logged.bit_length() and self._hooks.may_warn("warnings of malformed messages"):
+            log.warning("%s: %d malformed so far, last: %s", self.session.name, count, self.session.last_malformed)
+        self._malformed_logged = count
 
     def _fault(self, error: Exception) -> None:
         """End the session, and show where the code of its protocol is wrong."""
@@ -259,11 +266,6 @@ class Conversation(Receiver):
     def stalled(self) -> bool:
         """Whether the kernel has not taken all that was written."""
         return self.link is not None and not self.link.ready
-
-    @property
-    def unheard_s(self) -> float:
-        """Seconds since anything came by the link, or it came up."""
-        return self._clock() - self._heard_at
 
     @then_pump
     def cut(self, reason: str) -> None:
@@ -356,12 +358,3 @@ class Conversation(Receiver):
             link.close()
         if not self.ended.done():
             self.ended.set_result(None)
-
-    def _report_malformed(self) -> None:
-        """Warn at malformed messages 1, 2, 4, 8 ...: the log stays readable in a flood."""
-        count = self.session.traffic.malformed
-        self._hooks.malformed.value += count - self._malformed_logged
-        due = count.bit_length() != self._malformed_logged.bit_length()
-        if due and self._hooks.may_warn("warnings of malformed messages"):
-            log.warning("%s: %d malformed so far, last: %s", self.session.name, count, self.session.last_malformed)
-        self._malformed_logged = count

@@ -37,7 +37,7 @@ class Receiver:
         """React to a second source, or a second receiver, with the same claim: the peer has no source any more."""
 
     def stray_datagram(self, datagram: bytes) -> None:
-        """ReadPayload at a datagram of the peer's host that nobody claimed; the link has dropped it."""
+        """Inspect a datagram of the peer's host that nobody claimed; the link has dropped it."""
 
     def foreign_datagram(self) -> None:
         """Count a datagram from elsewhere; the link has dropped it."""

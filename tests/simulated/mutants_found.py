@@ -90,7 +90,7 @@ FOUND = (
     ),
     _mutant(
         "a robot that sleeps after packet 4 is written to",
-        "gateways/tcpudp/session/hq_handshake.py",
+        "gateways/tcpudp/session/hq_role.py",
         "        self.outbox.quiet(self._silent_until)\n",
         "",
     ),

@@ -6,7 +6,7 @@ from tests.simulated.mutants_data import DEVICE, Mutant
 
 SEQUENCE = "zbridge/app/handover/sequence.py"
 LISTENER = "zbridge/hq/handover.py"
-SESSION = "zbridge/protocol/session_kept.py"
+SESSION = "zbridge/protocol/session.py"
 
 
 def _mutant(name: str, file: str, old: str, new: str) -> Mutant:

@@ -23,8 +23,7 @@ from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import IDLE_STOP_S, STOP_REPEAT_S, Standstill
 from zbridge.errors import BusError, NotReady, Refused, Unsupported
 from zbridge.protocol.kept import Budget, Exported
-from zbridge.protocol.session import Session, State
-from zbridge.protocol.session_kept import PARTIAL
+from zbridge.protocol.session import PARTIAL, Session, State
 from zbridge.robot.claim import Standing
 from zbridge.robot.commands import Commands
 from zbridge.robot.connection import Connection, LinkHooks, Links, LinkSettings

@@ -33,7 +33,6 @@ class ClientConversation(Conversation):
     """A conversation with an accepted peer, whose session may have to say which datagrams come from that peer."""
 
     def claims(self, datagram: bytes, port: int) -> bool:
-        """Ask the session whether this datagram is from its peer."""
         session = self.session
         return isinstance(session, SourceClaims) and session.claims(datagram, port)
 
@@ -48,7 +47,6 @@ class ClientConversation(Conversation):
             log.warning("%s: another source of datagrams claims to be %s", self.session.name, self.session.peer)
 
     def stray_datagram(self, datagram: bytes) -> None:
-        """Show the session a datagram of the peer's host that nobody claimed."""
         session = self.session
         try:
             if isinstance(session, SourceClaims):

@@ -124,7 +124,6 @@ class Conversation(Receiver):
 
     @then_pump
     def attached(self, link: Link) -> None:
-        """Begin: the link is up."""
         self.link = self._observed = self.reading.link = link
         self.heard_at = self._clock()
         if self.connected_at is None:
@@ -136,7 +135,6 @@ class Conversation(Receiver):
         self.session.open(self._clock())
 
     def received(self, data: bytes) -> None:
-        """Take bytes from the link."""
         begun = self.heard_at = self._clock()
         try:
             self._before()
@@ -153,7 +151,6 @@ class Conversation(Receiver):
 
     @then_pump
     def received_datagram(self, datagram: bytes) -> None:
-        """Take a datagram from the link."""
         begun = self.heard_at = self._clock()
         if self.reading.rests:
             self._hooks.surplus.value += 1
@@ -162,7 +159,6 @@ class Conversation(Receiver):
         self.reading.worked(begun)
 
     def foreign_datagram(self) -> None:
-        """Count a datagram that came from elsewhere."""
         self.session.traffic.foreign += 1
         self._hooks.foreign.value += 1
 
@@ -189,7 +185,6 @@ class Conversation(Receiver):
 
     @then_pump
     def lost(self, reason: str) -> None:
-        """End: the link is gone."""
         if self._observed is not None:
             log.debug("%s: %s", self.session.peer, reason)
             self._hooks.linked(self._observed, False)
@@ -197,7 +192,6 @@ class Conversation(Receiver):
         self.session.lost(reason)
 
     def writable(self) -> None:
-        """Resume writing."""
         self.pump()
 
     def pump(self) -> None:

@@ -27,41 +27,31 @@ class FakeLink(Link):
         self.closed = False
 
     def write(self, data: bytes) -> None:
-        """Keep ``data``."""
         self.written.append(data)
 
     def write_datagram(self, data: bytes) -> None:
-        """Keep ``data``."""
         self.datagrams.append(data)
 
     def drop_source(self) -> None:
-        """Note the call."""
         self.sources_dropped += 1
 
     def pause_reading(self) -> None:
-        """Note the call."""
         self.paused = True
 
     def resume_reading(self) -> None:
-        """Note the call."""
         self.paused = False
 
     def suspend(self) -> None:
-        """Note the call."""
         self.suspended = True
 
     def resume(self) -> None:
-        """Note the call."""
         self.suspended = False
 
     def export(self, parcel: Parcel) -> Exported:
-        """Have nothing to hand over."""
         return {}
 
     def close(self) -> None:
-        """Note the call."""
         self.closed = True
 
     def abort(self) -> None:
-        """Note the call."""
         self.closed = True

@@ -85,20 +85,16 @@ class ZenohLink(Link):
         self._paused = True
 
     def resume_reading(self) -> None:
-        """Read again."""
         self._paused = False
 
     @property
     def blocker(self) -> str | None:
-        """Why this link cannot be handed to another process."""
         return "a Zenoh session stays in its process"
 
     def close(self) -> None:
-        """Close the session; idempotent."""
         self._end("closed")
 
     def abort(self) -> None:
-        """Close the session; idempotent."""
         self._end("closed")
 
     async def ended(self) -> None:

@@ -63,7 +63,6 @@ class SerialLink(Link):
 
     @property
     def descriptors(self) -> tuple[int, ...]:
-        """The line's file descriptor."""
         return (self._fd,) if self._open else ()
 
     @property
@@ -72,7 +71,6 @@ class SerialLink(Link):
         return self._open and self._close_by is None and not self._unwritten
 
     def write(self, data: bytes) -> None:
-        """Write ``data`` after what waits."""
         if not self._open or self._close_by is not None:
             return
         self._backlog.written(len(data), time.monotonic())
@@ -95,24 +93,20 @@ class SerialLink(Link):
         return backlog.waited_s(now)
 
     def pause_reading(self) -> None:
-        """Read nothing until :meth:`resume_reading`."""
         if self._reading:
             self._reading = False
             self._loop.remove_reader(self._fd)
 
     def resume_reading(self) -> None:
-        """Read again."""
         if self._open and self._close_by is None and not self._reading and not self._suspended:
             self._reading = True
             self._loop.add_reader(self._fd, self._read)
 
     def suspend(self) -> None:
-        """Read nothing until :meth:`resume`."""
         self._suspended = True
         self.pause_reading()
 
     def resume(self) -> None:
-        """Read again."""
         self._suspended = False
         self.resume_reading()
 
@@ -135,7 +129,6 @@ class SerialLink(Link):
             self._close_when_sent()
 
     def abort(self) -> None:
-        """Close the line now, whatever was written; idempotent."""
         self._end("closed")
 
     def _read(self) -> None:

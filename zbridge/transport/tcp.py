@@ -84,7 +84,6 @@ class TcpLink(asyncio.BufferedProtocol, Link):
 
     @property
     def descriptors(self) -> tuple[int, ...]:
-        """File descriptors of the stream, and of our own socket for datagrams where there is one."""
         if self._transport is None:
             return ()
         stream: int = self._transport.get_extra_info("socket").fileno()
@@ -92,7 +91,6 @@ class TcpLink(asyncio.BufferedProtocol, Link):
         return tuple(number for number in (stream, datagrams) if number >= 0)
 
     def write(self, data: bytes) -> None:
-        """Write ``data`` as one segment."""
         if self._transport is not None:
             if self._backlog is not None:
                 self._backlog.written(len(data), self._kernel.monotonic())
@@ -116,13 +114,11 @@ class TcpLink(asyncio.BufferedProtocol, Link):
             self._datagrams.send(data)
 
     def drop_source(self) -> None:
-        """Forget which source an accepted peer's datagrams come from; idempotent."""
         if self._hub is not None:
             self._hub.unbind(self)
 
     @property
     def silent_s(self) -> float:
-        """Seconds for which the peer's machine has not answered: it is unplugged, or its network fails."""
         if self._transport is None or not hasattr(socket, "TCP_INFO"):
             return 0.0
         sock = self._transport.get_extra_info("socket")
@@ -135,7 +131,6 @@ class TcpLink(asyncio.BufferedProtocol, Link):
 
     @property
     def unacknowledged_s(self) -> float:
-        """Seconds for which the oldest written byte has waited for its acknowledgement; see :class:`Link`."""
         backlog, transport = self._backlog, self._transport
         if backlog is None or backlog.since is None or transport is None:
             return 0.0
@@ -145,12 +140,10 @@ class TcpLink(asyncio.BufferedProtocol, Link):
         return backlog.waited_s(now)
 
     def pause_reading(self) -> None:
-        """Read nothing until :meth:`resume_reading`."""
         if self._transport is not None and self._transport.is_reading():
             self._transport.pause_reading()
 
     def resume_reading(self) -> None:
-        """Read again."""
         if self._transport is not None and not self._transport.is_reading():
             self._transport.resume_reading()
 
@@ -161,13 +154,11 @@ class TcpLink(asyncio.BufferedProtocol, Link):
         return "a tls connection cannot be handed over" if tls else None
 
     def suspend(self) -> None:
-        """Read nothing, neither stream nor datagrams of our own socket, until :meth:`resume`."""
         self.pause_reading()
         if self._datagrams is not None:
             self._datagrams.suspend()
 
     def resume(self) -> None:
-        """Read again, after :meth:`suspend`."""
         self.resume_reading()
         if self._datagrams is not None:
             self._datagrams.resume()
@@ -192,7 +183,6 @@ class TcpLink(asyncio.BufferedProtocol, Link):
                 asyncio.get_running_loop().call_later(CLOSE_S, self.abort)
 
     def abort(self) -> None:
-        """Close the connection now; what was written may be lost. Idempotent."""
         if self._transport is not None:
             self._transport.abort()
 

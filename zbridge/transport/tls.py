@@ -69,12 +69,10 @@ class TlsLink(Link, Receiver):
 
     @property
     def silent_s(self) -> float:
-        """Seconds for which the peer's machine has not answered."""
         return self._link.silent_s if self._link is not None else 0.0
 
     @property
     def unacknowledged_s(self) -> float:
-        """Seconds for which the oldest written byte has waited for its acknowledgement."""
         return self._link.unacknowledged_s if self._link is not None else 0.0
 
     def write(self, data: bytes) -> None:
@@ -84,18 +82,15 @@ class TlsLink(Link, Receiver):
             self._flush()
 
     def pause_reading(self) -> None:
-        """Read nothing until :meth:`resume_reading`."""
         if self._link is not None:
             self._link.pause_reading()
 
     def resume_reading(self) -> None:
-        """Read again."""
         if self._link is not None:
             self._link.resume_reading()
 
     @property
     def descriptors(self) -> tuple[int, ...]:
-        """The file descriptor of the stream; empty while there is no link."""
         return self._link.descriptors if self._link is not None else ()
 
     @property
@@ -104,7 +99,6 @@ class TlsLink(Link, Receiver):
         return "encrypted by this process"
 
     def close(self) -> None:
-        """Close the connection after what was written; idempotent."""
         link, self._link = self._link, None
         if link is not None:
             if self._open:
@@ -112,7 +106,6 @@ class TlsLink(Link, Receiver):
             link.close()
 
     def abort(self) -> None:
-        """Close the connection now; what was written may be lost. Idempotent."""
         link, self._link = self._link, None
         if link is not None:
             link.abort()
@@ -127,7 +120,6 @@ class TlsLink(Link, Receiver):
         self.receiver.attached(self)
 
     def received(self, data: bytes) -> None:
-        """Take encrypted bytes."""
         if self._link is None:
             return
         self._incoming.write(data)
@@ -146,13 +138,11 @@ class TlsLink(Link, Receiver):
             self._fail(f"TLS: {_said(error)}")
 
     def lost(self, reason: str) -> None:
-        """End: the connection is gone."""
         self._link = None
         self._stop_timer()
         self.receiver.lost(self._why or reason)
 
     def writable(self) -> None:
-        """Resume writing."""
         if self._open:
             self.receiver.writable()
 

@@ -156,12 +156,11 @@ class TcpUdpRobot(RobotSide):
 
     def _drive(self, command: Drive, now: float) -> Outcome:
         left_out = "light: a TCP/UDP robot has none" if command.light is not None else None
-        if not command.moving:
-            session = self._connected()
+        session, translation = self._connected(), math.hypot(command.forward, command.left)
+        if not (translation or command.turn):
             session.withdraw_autonomous()
             self._neutral(session, now)
             return Outcome(left_out=left_out)
-        translation = math.hypot(command.forward, command.left)
         moves: list[packets.Packet] = []
         if translation:
             speed = min(1.0, translation) * self.options.speed_full
@@ -174,7 +173,6 @@ class TcpUdpRobot(RobotSide):
             rotates = abs(command.turn) > translation
             moves = moves[1:] if rotates else moves[:1]
             left_out = f"{'forward and left' if rotates else 'turn'}: options.combine = 'exclusive'"
-        session = self._connected()
         frames = tuple(session.encode(packet) for packet in moves)
         session.outbox.set(_MOTION, frames, now, period_s=REPEAT_S)
         self._stop_until = -math.inf

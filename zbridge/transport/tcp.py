@@ -18,7 +18,7 @@ from zbridge.errors import LinkError
 from zbridge.metrics import Count
 from zbridge.protocol.address import Address
 from zbridge.protocol.kept import Exported
-from zbridge.transport.backlog import Backlog
+from zbridge.transport.backlog import LEAST_S, Backlog
 from zbridge.transport.door import Door, make_link
 from zbridge.transport.kernel import KERNEL, Kernel
 from zbridge.transport.link import STALLED_S, Link, Receiver, unwatched
@@ -135,8 +135,10 @@ class TcpLink(asyncio.BufferedProtocol, Link):
         if backlog is None or backlog.since is None or transport is None:
             return 0.0
         now = self._kernel.monotonic()
-        if now - backlog.since > STALLED_S:
-            backlog.settle(outstanding(transport, self._kernel))
+        waited_s = now - backlog.since
+        if waited_s <= STALLED_S:
+            return max(waited_s, LEAST_S)
+        backlog.settle(outstanding(transport, self._kernel))
         return backlog.waited_s(now)
 
     def pause_reading(self) -> None:

@@ -14,9 +14,9 @@ from zbridge.protocol.session import LINGER_S, State
 from zbridge.protocol.traffic import SourceClaims
 from zbridge.transport.accepted import ClientConversation
 from zbridge.transport.conversation import ConversationHooks
-from zbridge.transport.fair_share import BURST_S, FairShare
 from zbridge.transport.fake import FakeLink
 from zbridge.transport.link import STALLED_S
+from zbridge.transport.reading import BURST_S, FairShare
 
 pytestmark = pytest.mark.jumping
 

@@ -49,7 +49,7 @@ from zbridge.robot.ownership import Ownership
 from zbridge.robot.settings import DevicePlan
 from zbridge.tasks import together, until
 from zbridge.transport import Parcel, attach, connect
-from zbridge.transport.fair_share import FairShare
+from zbridge.transport.reading import FairShare
 
 log = logging.getLogger("zbridge.app.gateway")
 

@@ -22,7 +22,7 @@ from zbridge.protocol.session import Session, State
 from zbridge.protocol.session_table import Backoff, SessionTable
 from zbridge.robot.wire_tap import WireTap
 from zbridge.transport import Conversation, ConversationHooks, Link, Parcel, attach, connect
-from zbridge.transport.fair_share import FairShare
+from zbridge.transport.reading import FairShare
 from zbridge.wire.frames import Partial
 
 log = logging.getLogger("zbridge.link")

@@ -28,9 +28,8 @@ from zbridge.errors import FAULT, Refused, describe
 from zbridge.metrics import Count
 from zbridge.protocol.kept import Budget, Exported
 from zbridge.protocol.session import Datagram, Session, State
-from zbridge.transport.fair_share import FairShare
 from zbridge.transport.link import STALLED_S, Link, Receiver
-from zbridge.transport.reading import Reading
+from zbridge.transport.reading import FairShare, Reading
 from zbridge.transport.transferable import Parcel
 
 log = logging.getLogger("zbridge.link")

@@ -71,6 +71,7 @@ class AlfRobot(RobotSide):
     """One vehicle, with one link or two; the first link drives."""
 
     hands_over = True
+    driving: AlfHqRole | None = None
     kept: ClassVar[dict[str, Any]] = {
         "_scanner": messages.ScannerInit | None,
         "_clock": DeviceClock,
@@ -86,7 +87,6 @@ class AlfRobot(RobotSide):
         self.link_names = (VEHICLE,) if links == 1 else (DRIVE, LASER)
         self.dialect = options.dialect  # type: ignore[misc]
         self._dialect = messages.AlfDialect(options.dialect)
-        self._session: AlfHqRole | None = None
         acceleration, gyro = UNITS[self._dialect]
         self._acceleration = options.acceleration_m_s2 or acceleration
         self._gyro = options.gyro_rad_s or gyro
@@ -98,10 +98,6 @@ class AlfRobot(RobotSide):
         self._light = False
         self._backward = False
         self._command = self._neutral()
-
-    @property
-    def driving(self) -> AlfHqRole | None:
-        return self._session
 
     def session(self, link: str, peer: str) -> AlfHqRole:
         drives = link == self.link_names[0]
@@ -116,7 +112,7 @@ class AlfRobot(RobotSide):
             drives=self._command if drives else None,
         )
         if drives:
-            self._session = session
+            self.driving = session
         return session
 
     # Messages to telemetry
@@ -193,7 +189,7 @@ class AlfRobot(RobotSide):
         self._send(self._neutral(), now, urgent=True)
 
     def stop_frames(self) -> tuple[bytes, ...]:
-        return (self._session.encode(self._neutral()),) if self._session is not None else ()
+        return (self.driving.encode(self._neutral()),) if self.driving is not None else ()
 
     def ask(self, topic: Topic) -> None:
         raise Unsupported(f"an ALF vehicle cannot be asked for its {topic.path}")
@@ -219,9 +215,9 @@ class AlfRobot(RobotSide):
         return messages.DriveCommand(speed, _BACKWARD if backward else _FORWARD, straight + steering_deg, self._light)
 
     def _send(self, command: messages.DriveCommand, now: float, *, urgent: bool = False) -> None:
-        if self._session is None:
+        if self.driving is None:
             raise NotReady("offline")
-        self._session.drive(command, now, urgent=urgent)
+        self.driving.drive(command, now, urgent=urgent)
         self._command = command
         self._backward = command.direction == _BACKWARD
 

@@ -50,7 +50,7 @@ from zbridge.ros2 import (
 )
 from zbridge.simulation.simulator import STEP_S, live
 from zbridge.simulation.world import Body, Grid, cast
-from zbridge.transport import Conversation
+from zbridge.transport import Conversation, ConversationHooks
 from zbridge.transport.samples import serve
 
 log = logging.getLogger("gateways.ros2.simulator")
@@ -261,7 +261,7 @@ async def simulate(simulation: Simulation) -> None:
         for twist in twists:
             machine.take(twist)
 
-    conversation = Conversation(session, asyncio.get_running_loop(), deliver=deliver)
+    conversation = Conversation(session, asyncio.get_running_loop(), ConversationHooks(deliver=deliver))
     async with serve(address, conversation):
         simulation.ready((address,))
         try:

@@ -60,6 +60,7 @@ _NS_PER_MS = 1_000_000
 class RosRobot(RobotSide):
     """One ROS 2 robot: the nodes on the other side of its router."""
 
+    driving: RosRole | None = None
     link_names = ("router",)
     closing_harmless = True
 
@@ -68,7 +69,6 @@ class RosRobot(RobotSide):
         self.options = options
         self._types = types_of(options.distro)
         self.dialect = options.distro  # type: ignore[misc]
-        self._session: RosRole | None = None
         self._scanner: Scanner | None = None
         self._known: dict[str, FleetMessage] = {}
         self._speed: float | None = None
@@ -77,15 +77,11 @@ class RosRobot(RobotSide):
         self._astray = metrics.count("stamps_astray")
         self._overruled = metrics.count("commands_overruled")
 
-    @property
-    def driving(self) -> RosRole | None:
-        return self._session
-
     def session(self, link: str, peer: str) -> RosRole:
-        self._session = RosRole(self.options, self._types, self._overruled)
+        self.driving = RosRole(self.options, self._types, self._overruled)
         self._scanner, self._speed, self._has_imu = None, None, False
         self._known.clear()
-        return self._session
+        return self.driving
 
     # Messages to telemetry
 
@@ -230,9 +226,9 @@ class RosRobot(RobotSide):
         return self._known.get(topic.path)
 
     def _connected(self) -> RosRole:
-        if self._session is None or self._session.over:
+        if self.driving is None or self.driving.over:
             raise NotReady("offline")
-        return self._session
+        return self.driving
 
 
 def _require(holds: bool, otherwise: str) -> None:

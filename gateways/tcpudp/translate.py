@@ -62,6 +62,7 @@ class TcpUdpRobot(RobotSide):
     """One robot of the TCP/UDP package protocol, seen from its HQ."""
 
     hands_over = True
+    driving: HqRole | None = None
     kept: ClassVar[dict[str, Any]] = {
         "_chosen": str | None,
         "_stop_until": float,
@@ -74,7 +75,6 @@ class TcpUdpRobot(RobotSide):
         self._force = tuple(Feature(entry) if isinstance(entry, str) else entry for entry in options.force)
         self._announce = tuple(Feature(name) for name in options.announce)
         self._telemetry = TelemetryTranslator(options)
-        self._session: HqRole | None = None
         self._chosen: str | None = None
         """The mode that was commanded last."""
         self._stop_until = -math.inf
@@ -82,22 +82,18 @@ class TcpUdpRobot(RobotSide):
         self._was_autonomous = False
         """Whether a gateway before this one may have sent mode 3."""
 
-    @property
-    def driving(self) -> HqRole | None:
-        return self._session
-
     def session(self, link: str, peer: str) -> HqRole:
-        self._session = HqRole(
+        self.driving = HqRole(
             limits(self.options.gap_s),
             udp=self.options.udp,
             force=self._force,
             announce=self._announce,
-            predecessor=self._session,
+            predecessor=self.driving,
         )
-        self._session.sent_autonomous = self._session.sent_autonomous or self._was_autonomous
+        self.driving.sent_autonomous = self.driving.sent_autonomous or self._was_autonomous
         self._stop_until = -math.inf
-        self._telemetry.begin(self._session)
-        return self._session
+        self._telemetry.begin(self.driving)
+        return self.driving
 
     def translator(self, kind: type) -> Translate:
         return self._telemetry.translator(kind)
@@ -128,12 +124,12 @@ class TcpUdpRobot(RobotSide):
     def was_autonomous(self) -> None:
         """Send the pair of packets from the first stop on ("Stops after mode 3")."""
         self._was_autonomous = True
-        if self._session is not None:
-            self._session.sent_autonomous = True
+        if self.driving is not None:
+            self.driving.sent_autonomous = True
 
     @property
     def idle_stop_s(self) -> float:
-        return IDLE_STOP_S if self._session is not None and self._session.misreads else math.inf
+        return IDLE_STOP_S if self.driving is not None and self.driving.misreads else math.inf
 
     def stop_frames(self) -> tuple[bytes, ...]:
         """Packet 13; the pair also where mode 3 was commanded and is not written yet."""
@@ -142,7 +138,7 @@ class TcpUdpRobot(RobotSide):
 
     def begun(self, stamp_ns: int) -> tuple[Telemetry, ...]:
         """Load numpy for a robot with maps or simulated lidar: now, not with the first one while it moves."""
-        session = self._session
+        session = self.driving
         if session is not None and {Feature.SLAM_MAP.value, Feature.LIDAR_SIM.value} & set(session.features):
             import numpy  # noqa: F401
         return ()
@@ -160,12 +156,11 @@ class TcpUdpRobot(RobotSide):
 
     def _drive(self, command: Drive, now: float) -> Outcome:
         left_out = "light: a TCP/UDP robot has none" if command.light is not None else None
-        if not command.moving:
-            session = self._connected()
+        session, translation = self._connected(), math.hypot(command.forward, command.left)
+        if not (translation or command.turn):
             session.withdraw_autonomous()
             self._neutral(session, now)
             return Outcome(left_out=left_out)
-        translation = math.hypot(command.forward, command.left)
         moves: list[packets.Packet] = []
         if translation:
             speed = min(1.0, translation) * self.options.speed_full
@@ -178,7 +173,6 @@ class TcpUdpRobot(RobotSide):
             rotates = abs(command.turn) > translation
             moves = moves[1:] if rotates else moves[:1]
             left_out = f"{'forward and left' if rotates else 'turn'}: options.combine = 'exclusive'"
-        session = self._connected()
         frames = tuple(session.encode(packet) for packet in moves)
         session.outbox.set(_MOTION, frames, now, period_s=REPEAT_S)
         self._stop_until = -math.inf
@@ -243,9 +237,9 @@ class TcpUdpRobot(RobotSide):
         return (packets.ClientControllMode(mode), stop) if paired else (stop,)
 
     def _connected(self) -> HqRole:
-        if self._session is None:
+        if self.driving is None:
             raise NotReady("offline")
-        return self._session
+        return self.driving
 
 
 def _sendable(session: HqRole, wanted: Iterable[packets.Packet]) -> tuple[bytes, ...]:

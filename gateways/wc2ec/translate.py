@@ -57,6 +57,7 @@ class Wc2EcRobot(RobotSide):
     """One Webots robot, seen from its external controller."""
 
     hands_over = True
+    driving: ExternalRole | None = None
     kept: ClassVar[dict[str, Any]] = {"_table": RegisteredDevices, "_ring": BearingScan | None}
     link_names = ("robot",)
 
@@ -65,7 +66,6 @@ class Wc2EcRobot(RobotSide):
         self.options = options
         self.dialect = options.dialect  # type: ignore[misc]
         self._dialect = messages.Wc2EcDialect(options.dialect)
-        self._session: ExternalRole | None = None
         self._table = RegisteredDevices()
         self._subscribed: set[str] = set(options.pinned)
         self._ring: BearingScan | None = None
@@ -76,10 +76,6 @@ class Wc2EcRobot(RobotSide):
         self._motor_names = {ROTATIONAL: options.motors.rotational, LINEAR: options.motors.linear}
 
     @property
-    def driving(self) -> ExternalRole | None:
-        return self._session
-
-    @property
     def on_demand(self) -> tuple[Topic, ...]:
         """Sensors of the draft: they measure while somebody listens."""
         if self._dialect is messages.Wc2EcDialect.DEPLOYED:
@@ -87,12 +83,12 @@ class Wc2EcRobot(RobotSide):
         return tuple(topics.SENSOR(device.name) for device in self.options.devices)
 
     def session(self, link: str, peer: str) -> ExternalRole:
-        self._session = ExternalRole(self._dialect)
+        self.driving = ExternalRole(self._dialect)
         self._table = RegisteredDevices()
         self._ring = self._new_ring()
         for option in self.options.devices if self._dialect is messages.Wc2EcDialect.DRAFT else ():
             self._table.add(WebotsDevice(option.name, option.name, option.number, 0, option.kind))
-        return self._session
+        return self.driving
 
     def _new_ring(self) -> BearingScan | None:
         options = self.options
@@ -274,9 +270,9 @@ class Wc2EcRobot(RobotSide):
         self._connected().send(message)
 
     def _connected(self) -> ExternalRole:
-        if self._session is None:
+        if self.driving is None:
             raise NotReady("offline")
-        return self._session
+        return self.driving
 
 
 def _slot(device: WebotsDevice) -> str:

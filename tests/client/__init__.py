@@ -51,7 +51,7 @@ class Machine(RobotSide):
 
     @property
     def driving(self) -> Any:
-        return SimpleNamespace(over=False, busy=None, doubtful=None, state=State.ESTABLISHED)
+        return SimpleNamespace(over=False, busy=None, doubts=(), doubtful=None, state=State.ESTABLISHED)
 
     def translator(self, kind: type) -> Any:
         raise NotImplementedError

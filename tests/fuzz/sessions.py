@@ -231,7 +231,7 @@ GOLDEN: dict[str, Any] = {"alf": alf, "tcpudp": tcpudp, "wc2ec": wc2ec}
 _ALF = ("gateways/alf/session.py", "gateways/alf/translate.py", "gateways/alf/hq.py")
 _WC2EC = ("gateways/wc2ec/session.py", "gateways/wc2ec/devices.py", "gateways/wc2ec/translate.py")
 _TCPUDP = ("gateways/tcpudp/session/robot_role.py", "gateways/tcpudp/session/hq_role.py",
-           "gateways/tcpudp/session/hq_handshake.py", "gateways/tcpudp/settings.py",
+           "gateways/tcpudp/session/signs.py", "gateways/tcpudp/settings.py",
            "gateways/tcpudp/telemetry.py", "gateways/tcpudp/hq_client.py")  # fmt: skip
 ROLES: tuple[tuple[str, Make, tuple[str, ...], bytes], ...] = (
     ("session-alf-robot-text", _robot(ALF, points=3), _ALF, stream("alf-laser.hex", source=16667)),

@@ -145,8 +145,6 @@ COMMANDS: dict[bytes, Telemetry] = {
 class HandLink(FakeLink):
     """A link that ends as a real one does: its receiver is told soon after it was closed."""
 
-    receiver: Receiver
-
     def close(self) -> None:
         if not self.closed:
             super().close()
@@ -160,13 +158,11 @@ class Program:
     """An HQ program at the other end of a link."""
 
     def __init__(self, receiver: Receiver, peer: str) -> None:
-        self.receiver = receiver
-        self.link = HandLink(peer)
-        self.link.receiver = receiver
+        self.link = HandLink(peer, receiver)
         receiver.attached(self.link)
 
     def say(self, *messages: bytes) -> None:
-        self.receiver.received(b"".join(map(framed, messages)))
+        self.link.receiver.received(b"".join(map(framed, messages)))
 
     def greeted(self) -> Program:
         """Shake hands, and forget what was heard."""
@@ -188,7 +184,7 @@ class Program:
     def leave(self) -> None:
         if not self.link.closed:
             self.link.closed = True
-            self.receiver.lost("closed by peer")
+            self.link.receiver.lost("closed by peer")
 
     def hears(self, text: str) -> None:
         assert (b", ".join(self.heard()).decode() or NOTHING) == text
@@ -198,7 +194,7 @@ class Program:
 
     def takes(self) -> None:
         self.link.ready = True
-        self.receiver.writable()
+        self.link.receiver.writable()
 
     def is_(self, state: str) -> None:
         assert self.link.closed is (state == "closed"), state
@@ -326,7 +322,7 @@ def spelled(*values: object) -> str:
 
 SAYS: dict[str, Callable[[Program, str], object]] = {
     "says": lambda program, text: program.say(*text.encode().split(b", ")),
-    "garbles": lambda program, text: program.receiver.received(framed(text.encode()) + b"\xff rubbish"),
+    "garbles": lambda program, text: program.link.receiver.received(framed(text.encode()) + b"\xff rubbish"),
     "hears": Program.hears,  # since the last look
     "leaves": lambda program, _: program.leave(),
     "stalls": lambda program, _: program.stalls(),

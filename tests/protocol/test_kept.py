@@ -16,8 +16,7 @@ from zbridge.metrics import Metrics
 from zbridge.protocol.kept import Budget, Kept, Spare
 from zbridge.protocol.outbox import Outbox
 from zbridge.protocol.plugin import Protocol, find_protocol
-from zbridge.protocol.session import Limits, Session
-from zbridge.protocol.session_kept import PARTIAL, SKIPPED
+from zbridge.protocol.session import PARTIAL, SKIPPED, Limits, Session
 from zbridge.protocol.traffic import Datagram
 
 SETTINGS = bytes.fromhex("210000000102020b000000312e312c312e322c312e3300010101010101e803000064000000")

@@ -34,6 +34,7 @@ from zbridge.bus.fake import FakeBus, FakeQuery, meet
 from zbridge.bus.interface import Sort
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
+from zbridge.control.context import Conditions, Faults, RobotContext
 from zbridge.control.latch import Latches
 from zbridge.errors import LinkError
 from zbridge.fleet import topics
@@ -41,7 +42,9 @@ from zbridge.fleet.topics import KeySpace
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.protocol.session_table import SessionTable
-from zbridge.robot.device import RobotDevice
+from zbridge.robot.connection import LinkSettings
+from zbridge.robot.device import ControlParts, RobotDevice
+from zbridge.robot.observer import Observer
 from zbridge.transport.conversation import Conversation
 from zbridge.transport.fake import FakeLink
 
@@ -182,6 +185,7 @@ class Rig:
         deadman_s: float = 2.0,
         bus: OpenBus | None = None,
         latches: Latches | None = None,
+        observer: Observer | None = None,
         **more: Any,
     ) -> None:
         self.loop = asyncio.get_running_loop()
@@ -195,18 +199,30 @@ class Rig:
         self.settings = SETTINGS
         self.audit_lines: list[str] = []
         self.device = RobotDevice(
-            TcpUdpRobot(TcpUdpOptions()),
-            (ADDRESS,),
-            protocol="tcpudp",
-            keys=KeySpace("fleet", "r1"),
-            bus=self.bus,
-            authority=Authority(lease_s, deadman_s, numbered(), latches=latches),
-            manager=self.manager,
-            metrics=self.metrics,
-            audit=Audit("r1", self.audit_lines.append),
-            connect=self._connect,
-            clock_ns=lambda: 1234,
-            **{"idle_stop_s": 0.0, **more},
+            RobotContext(
+                TcpUdpRobot(TcpUdpOptions()),
+                KeySpace("fleet", "r1"),
+                self.bus,
+                self.metrics,
+                Conditions(),
+                Faults("r1"),
+                clock=self.loop.time,
+                clock_ns=lambda: 1234,
+                **{clock: more.pop(clock) for clock in ("raw_ms", "suspended_s") if clock in more},
+            ),
+            "tcpudp",
+            LinkSettings(
+                addresses=(ADDRESS,),
+                sessions=self.manager,
+                connect=self._connect,
+                **({"attach": more.pop("attach")} if "attach" in more else {}),
+            ),
+            ControlParts(
+                authority=Authority(lease_s, deadman_s, numbered(), latches=latches),
+                audit=Audit("r1", self.audit_lines.append),
+                **{"idle_stop_s": 0.0, **more},
+            ),
+            observer,
         )
         self.driver, self.other = Program(self, "driver"), Program(self, "other")
         self.hold = self.driver.acquire

@@ -133,18 +133,18 @@ async def test_a_robot_that_has_not_agreed_is_not_healthy() -> None:
 
 async def test_latched_stops_of_the_other_gateway_are_in_force_from_the_first_moment(rig: Rig) -> None:
     await aside(rig)
-    rig.device.merge(LatchRecord((Latch(b"\x07" * 16, "ann", "wet floor"),)))
+    rig.device.enforcer.merge(LatchRecord((Latch(b"\x07" * 16, "ann", "wet floor"),)))
     await rig.device.step_in()
     assert rig.control["state"] == "latched"
     assert [latch.who for latch in rig.device.standing.record.latches] == ["ann"]
 
 
 async def test_nobody_else_stops_the_robot_if_this_process_dies_meanwhile(rig: Rig) -> None:
-    assert [frame.data for frame in rig.device.last_stop().frames] == [STOP]
+    assert [frame.data for frame in rig.device.observed.last_stop().frames] == [STOP]
     await aside(rig)
-    assert rig.device.last_stop().frames == ()
+    assert rig.device.observed.last_stop().frames == ()
     await rig.device.step_in()
-    assert [frame.data for frame in rig.device.last_stop().frames] == [STOP]
+    assert [frame.data for frame in rig.device.observed.last_stop().frames] == [STOP]
 
 
 async def test_a_successor_of_a_gateway_that_stands_aside_stands_aside_too(rig: Rig) -> None:
@@ -157,7 +157,7 @@ async def test_a_successor_of_a_gateway_that_stands_aside_stands_aside_too(rig: 
     assert given["links"][0]["connected_at"] == pytest.approx(rig.loop.time() - rig.device.standing.connected_s)
     later = Rig(bus=rig.bus)
     await later.device.restore(given, Parcel())
-    assert later.device.last_stop().frames == ()
+    assert later.device.observed.last_stop().frames == ()
     before: Any = counts(rig)
     begun = asyncio.Event()
 

@@ -48,15 +48,15 @@ def latches(**record: Any) -> Latches:
 
 async def test_mode_autonomous_reaches_the_robot_when_it_is_written_down_and_not_before() -> None:
     disk = Disk()
-    async with established(keep_latches=disk.keep) as rig:
+    async with established(save=disk.keep) as rig:
         rig.command("mode", {"mode": "autonomous"})
         await asyncio.sleep(WRITE_S / 2)
         assert (rig.written(), disk.record) == ([], LatchRecord(autonomous=True))
-        assert not rig.device.driven
+        assert not rig.device.observed.driven
         disk.written()
         await rig.settle()
         assert rig.written() == [AUTONOMOUS]
-        assert rig.device.driven
+        assert rig.device.observed.driven
         rig.command("mode", {"mode": "autonomous"})
         await asyncio.sleep(0.05)
         assert rig.written() == [AUTONOMOUS], "it stands on the disk already"
@@ -77,7 +77,7 @@ async def test_what_comes_while_mode_autonomous_is_written_down_takes_its_place(
     then: Callable[[Rig], object], expected: list[bytes]
 ) -> None:
     disk = Disk()
-    async with established(keep_latches=disk.keep) as rig:
+    async with established(save=disk.keep) as rig:
         rig.command("mode", {"mode": "autonomous"})
         then(rig)
         disk.written()
@@ -90,7 +90,7 @@ async def test_what_comes_while_mode_autonomous_is_written_down_takes_its_place(
 
 async def test_motion_while_mode_autonomous_is_written_down_goes_first() -> None:
     disk = Disk()
-    async with established(keep_latches=disk.keep) as rig:
+    async with established(save=disk.keep) as rig:
         rig.command("mode", {"mode": "autonomous"})
         await rig.play("left > left")
         disk.written()
@@ -100,7 +100,7 @@ async def test_motion_while_mode_autonomous_is_written_down_goes_first() -> None
 
 async def test_a_disk_that_is_too_slow_refuses_the_mode_and_the_next_attempt_finds_it_written() -> None:
     disk = Disk()
-    async with established(keep_latches=disk.keep) as rig:
+    async with established(save=disk.keep) as rig:
         rig.command("mode", {"mode": "autonomous"})
         await asyncio.sleep(WRITE_S + 0.1)
         disk.written()
@@ -113,7 +113,7 @@ async def test_a_disk_that_is_too_slow_refuses_the_mode_and_the_next_attempt_fin
 
 async def test_a_gateway_that_ends_while_the_mode_is_written_down_sends_none() -> None:
     disk = Disk()
-    async with established(keep_latches=disk.keep) as rig:
+    async with established(save=disk.keep) as rig:
         rig.command("mode", {"mode": "autonomous"})
         await rig.device.prepare("gateway restarted", 1.0)
         disk.written()
@@ -125,7 +125,7 @@ async def test_a_gateway_that_reads_that_the_robot_was_told_to_move_by_itself_st
     for restored in (False, True):
         async with established() as rig:
             if restored:
-                rig.device.restore_latches(latches(autonomous=True))
+                rig.device.enforcer.restore(latches(autonomous=True))
             await rig.play("acquire left > left")
             rig.command("stop")
             await asyncio.sleep(0.05)
@@ -135,10 +135,10 @@ async def test_a_gateway_that_reads_that_the_robot_was_told_to_move_by_itself_st
 async def test_another_gateway_says_so_the_robot_is_stopped_at_once_unless_it_is_driven() -> None:
     for driven in (False, True):
         disk = Disk()
-        async with established(keep_latches=disk.keep) as rig:
+        async with established(save=disk.keep) as rig:
             if driven:
                 await rig.play("left > left")
-            rig.device.merge(LatchRecord(autonomous=True))
+            rig.device.enforcer.merge(LatchRecord(autonomous=True))
             assert disk.record == LatchRecord(autonomous=True)
             assert rig.device.standing.record.autonomous
             await asyncio.sleep(0.05)
@@ -148,7 +148,7 @@ async def test_another_gateway_says_so_the_robot_is_stopped_at_once_unless_it_is
             assert rig.written()[:2] == [NONE, STOP]
             await asyncio.sleep(2.0)
             rig.forget_written()
-            rig.device.merge(LatchRecord(autonomous=True))
+            rig.device.enforcer.merge(LatchRecord(autonomous=True))
             assert rig.written() == [], "it is no news"
 
 

@@ -220,8 +220,8 @@ async def test_a_successor_knows_what_the_gateway_before_it_knew_unless_that_die
 
 async def test_what_was_written_down_is_in_force_before_anything_is_served_and_changes_are_written() -> None:
     written: list[LatchRecord] = []
-    async with serving(keep_latches=lambda latches: written.append(latches.record)) as rig:
-        rig.device.restore_latches(Latches(LatchRecord((Latch(IDS[0], "ann"),))))
+    async with serving(save=lambda latches: written.append(latches.record)) as rig:
+        rig.device.enforcer.restore(Latches(LatchRecord((Latch(IDS[0], "ann"),))))
         await rig.establish()
         assert asks(rig) == "latched"
         latch(rig, IDS[1])
@@ -240,7 +240,7 @@ async def test_a_latched_stop_is_confirmed_when_it_is_written_down_and_the_robot
         writing.append(asyncio.get_running_loop().create_future())
         return writing[-1]
 
-    async with established(keep_latches=keep) as rig:
+    async with established(save=keep) as rig:
         latch(rig, IDS[0])
         await asyncio.sleep(0.1)
         assert STOP in rig.written()

@@ -15,7 +15,7 @@ from tests.clock import scene_of
 from tests.proofs import packed
 from tests.robot.scene import COMMANDS, SETTINGS, STOP, Rig, TimedLink, established, serving
 from zbridge.protocol.kept import Budget
-from zbridge.robot.observer import Boundary, LastStop, Nobody, StopFrame
+from zbridge.robot.observer import Boundary, LastStop, Observer, StopFrame
 from zbridge.transport import Parcel
 from zbridge.transport.conversation import Conversation
 from zbridge.wire.frames import Partial
@@ -32,7 +32,7 @@ LIDAR_ON = bytes.fromhex("060000000133 01000000")
 rig = scene_of(established)
 
 
-class Notes(Nobody):
+class Notes(Observer):
     """An observer that keeps what it is told."""
 
     def __init__(self) -> None:
@@ -59,21 +59,21 @@ class Notes(Nobody):
 
 async def test_the_stop_of_a_robot_is_known_once_it_is_established() -> None:
     async with serving(hold=False) as rig:
-        assert rig.device.last_stop() == LastStop(state="handshaking")
+        assert rig.device.observed.last_stop() == LastStop(state="handshaking")
         await rig.establish()
-        assert rig.device.last_stop() == AT_REST
+        assert rig.device.observed.last_stop() == AT_REST
         rig.goes()
-        assert rig.device.last_stop().frames == ()
+        assert rig.device.observed.last_stop().frames == ()
 
 
 async def test_a_robot_that_is_driven_or_drives_itself_counts_as_driven(rig: Rig) -> None:
-    assert not rig.device.driven
+    assert not rig.device.observed.driven
     rig.command("drive", {"left": 1.0})
-    assert rig.device.driven
+    assert rig.device.observed.driven
     await rig.play("neutral 0.1")
-    assert not rig.device.driven
+    assert not rig.device.observed.driven
     await rig.play("autonomous 0.5")
-    last = rig.device.last_stop()
+    last = rig.device.observed.last_stop()
     assert last.driven
     assert [frame.data for frame in last.frames] == [NONE, STOP]
 
@@ -99,11 +99,11 @@ async def test_an_observer_is_told_of_the_link_and_of_every_read() -> None:
 
 
 async def test_a_link_that_holds_bytes_back_may_stand_within_a_frame(rig: Rig) -> None:
-    assert rig.device.boundary("robot") == Boundary()
+    assert rig.device.observed.boundary("robot") == Boundary()
     rig.link.ready = False
-    assert rig.device.boundary("robot") == Boundary(outgoing=False)
-    assert rig.device.boundary("another") == Boundary(outgoing=False)
-    assert rig.device.partial("another", 100) is None
+    assert rig.device.observed.boundary("robot") == Boundary(outgoing=False)
+    assert rig.device.observed.boundary("another") == Boundary(outgoing=False)
+    assert rig.device.observed.partial("another", 100) is None
 
 
 async def test_a_robot_that_is_not_established_leaves_nothing_to_go_on_with() -> None:

@@ -134,4 +134,4 @@ async def test_a_read_from_the_robot_shows_that_the_machine_was_suspended_too() 
         suspended[0] = 5.0
         rig.sends(bytes.fromhex("0e000000 01 37 00000000 00000000 00000000"))
         assert words(rig)[:1] == ["stop"]
-        assert rig.device.driven is False
+        assert rig.device.observed.driven is False

@@ -234,9 +234,9 @@ MUTANTS = (
     Mutant(
         "stalled link is written to",
         "situations",
-        "zbridge/transport/stalls.py",
-        "        blocked = waited_s > (0.0 if self.blocked else STALLED_S)",
-        "        blocked = False",
+        "zbridge/transport/conversation.py",
+        "(waited_s > (0.0 if self._blocked else STALLED_S)) is not self._blocked",
+        "self._blocked",
     ),
     Mutant(
         "drives wait for a stalled link for ever",
@@ -296,7 +296,7 @@ MUTANTS = (
         "            OwnershipInput.OUTBID: (_withdraw, OwnershipState.LOOKING),",
         "            OwnershipInput.OUTBID: (_withdraw, OwnershipState.LOOKING),",
     ),
-    Mutant("robot not stopped by who yields", "situations", DEVICE, "        self._enforcer.stop(_ASIDE)\n", ""),
+    Mutant("robot not stopped by who yields", "situations", DEVICE, "        self.enforcer.stop(_ASIDE)\n", ""),
     Mutant(
         "claim without latches",
         "ownership",
@@ -428,7 +428,7 @@ MUTANTS = (
         "no heartbeat",
         None,
         DEVICE,
-        "                self._presence.publish_status()\n                self._enforcer.beat()",
+        "                self._presence.publish_status()\n                self.enforcer.beat()",
         "                pass",
     ),
     Mutant(

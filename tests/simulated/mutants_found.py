@@ -90,7 +90,7 @@ FOUND = (
     ),
     _mutant(
         "a robot that sleeps after packet 4 is written to",
-        "gateways/tcpudp/session/hq_handshake.py",
+        "gateways/tcpudp/session/hq_role.py",
         "        self.outbox.quiet(self._silent_until)\n",
         "",
     ),
@@ -133,7 +133,7 @@ FOUND = (
     _mutant(
         "a latched stop that comes during a restart is lost",
         "zbridge/app/gateway.py",
-        "                    device.restore_latches(store.load())  # one that came last is only in the file\n",
+        "                    device.enforcer.restore(store.load())  # one that came last is only in the file\n",
         "",
     ),
     _mutant(
@@ -145,25 +145,23 @@ FOUND = (
     _mutant(
         "the stop of a gateway that serves its robot again comes before it may write",
         DEVICE,
-        """        self._aside = False
+        """        self.observed.aside = False
         for connection in self._links:
             connection.mute(False)
         self._publishers.mute(False)
         self._listen()
-        self._commands.refuse_all(None)
-        self._leases.refuse_all(None)
+        self._refuse_all(None)
         self._latch_news.returned()
         self._standstill.begin()
-        self._enforcer.stop("served again")
+        self.enforcer.stop("served again")
 """,
-        """        self._aside = False
-        self._enforcer.stop("served again")
+        """        self.observed.aside = False
+        self.enforcer.stop("served again")
         for connection in self._links:
             connection.mute(False)
         self._publishers.mute(False)
         self._listen()
-        self._commands.refuse_all(None)
-        self._leases.refuse_all(None)
+        self._refuse_all(None)
         self._latch_news.returned()
         self._standstill.begin()
 """,
@@ -230,7 +228,7 @@ FOUND = (
     _mutant(
         "a gateway that serves its robot again forgets the owner's latched stops",
         "zbridge/app/serving.py",
-        "        self._device.merge(self._owners_record)\n        await self._device.step_in()\n",
+        "        self._device.enforcer.merge(self._owners_record)\n        await self._device.step_in()\n",
         "        await self._device.step_in()\n",
     ),
     _mutant(

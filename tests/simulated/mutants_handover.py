@@ -6,7 +6,7 @@ from tests.simulated.mutants_data import DEVICE, Mutant
 
 SEQUENCE = "zbridge/app/handover/sequence.py"
 LISTENER = "zbridge/hq/handover.py"
-SESSION = "zbridge/protocol/session_kept.py"
+SESSION = "zbridge/protocol/session.py"
 
 
 def _mutant(name: str, file: str, old: str, new: str) -> Mutant:
@@ -17,7 +17,7 @@ HANDOVER = (
     _mutant(
         "the robot is not stopped before a restart",
         DEVICE,
-        "        self._enforcer.stop(reason)\n        self._context.pump()\n",
+        "        self.enforcer.stop(reason)\n        self._context.pump()\n",
         "        self._context.pump()\n",
     ),
     _mutant(

@@ -10,7 +10,7 @@ import uvloop
 
 from tests.protocol.test_session import LIMITS, Toy
 from zbridge.protocol.address import Address
-from zbridge.transport.conversation import Conversation
+from zbridge.transport.conversation import Conversation, ConversationHooks
 from zbridge.transport.tcp import connect
 
 SILENCE_S = 0.4
@@ -40,7 +40,7 @@ class Watching(Toy):
 async def main(port: int) -> None:
     """Be connected until the session ends."""
     session = Watching(LIMITS, name="robot")
-    conversation = Conversation(session, asyncio.get_running_loop(), deliver=lambda messages: None)
+    conversation = Conversation(session, asyncio.get_running_loop(), ConversationHooks())
     await connect(Address("127.0.0.1", port), conversation)
     await conversation.ended
     print(session.reason, flush=True)

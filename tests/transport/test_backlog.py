@@ -1,8 +1,6 @@
 """Since when bytes have waited for their acknowledgement."""
 
 from zbridge.transport.backlog import ENTRIES, Backlog
-from zbridge.transport.fake import FakeLink
-from zbridge.transport.stalls import Stalls
 
 
 def test_the_oldest_unacknowledged_write_counts_and_a_part_of_it_too() -> None:
@@ -36,11 +34,10 @@ def test_what_is_kept_is_bounded_and_the_oldest_stays_true() -> None:
         assert backlog.since == since
 
 
-def test_a_link_is_looked_at_again_after_a_write_though_the_clock_has_not_moved_since() -> None:
-    backlog, link = Backlog(), FakeLink()
+def test_a_write_has_waited_though_the_clock_has_not_moved_since() -> None:
+    backlog = Backlog()
     assert backlog.waited_s(5.0) == 0.0
     backlog.written(6, 5.0)
-    link.unacknowledged_s = backlog.waited_s(5.0)
-    assert Stalls(lambda: 5.0, lambda stalled: None).next(None, link) is not None
+    assert backlog.waited_s(5.0) > 0.0
     backlog.settle(0)
     assert backlog.waited_s(6.0) == 0.0

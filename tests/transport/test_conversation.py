@@ -11,9 +11,12 @@ from tests.protocol.test_session import LIMITS, Toy
 from zbridge.errors import NotReady
 from zbridge.metrics import Count
 from zbridge.protocol.session import LINGER_S, State
-from zbridge.transport.conversation import Conversation
-from zbridge.transport.fair_share import BURST_S, FairShare
+from zbridge.protocol.traffic import SourceClaims
+from zbridge.transport.accepted import ClientConversation
+from zbridge.transport.conversation import ConversationHooks
 from zbridge.transport.fake import FakeLink
+from zbridge.transport.link import STALLED_S
+from zbridge.transport.reading import BURST_S, FairShare
 
 pytestmark = pytest.mark.jumping
 
@@ -21,18 +24,13 @@ WELCOME = b"\x07welcome"
 
 
 class Rig:
-    def __init__(self, **more: Any) -> None:
+    def __init__(self, made: type[Toy] = Toy, **more: Any) -> None:
         self.loop = asyncio.get_running_loop()
-        self.session = Toy(LIMITS, name="robot")
+        self.session: Any = made(LIMITS, name="robot")
         self.link = FakeLink("tcp://toy.test:1")
         self.happened: list[object] = []
-        self.conversation = Conversation(
-            self.session,
-            self.loop,
-            deliver=self.happened.append,
-            changed=lambda: self.happened.append(self.session.state),
-            **more,
-        )
+        hooks = {"deliver": self.happened.append, "changed": lambda: self.happened.append(self.session.state), **more}
+        self.conversation = ClientConversation(self.session, self.loop, ConversationHooks(**hooks))
 
     def begin(self) -> "Rig":
         """Establish the session, and forget what happened."""
@@ -208,7 +206,7 @@ async def test_a_lost_link_or_abandoning_ends_the_conversation_and_nothing_happe
     assert up.session.reason == ("abandoned" if abandoned else "closed by peer")
     up.conversation.pump()
     up.conversation.received(b"\x01a")
-    up.conversation.pause_reading()
+    up.conversation.reading.pause()
     await asyncio.sleep(100)
     assert (up.happened, up.link.written, up.link.paused) == ([State.CLOSED], [], False)
     Rig().conversation.abandon()  # it never had a link
@@ -256,28 +254,39 @@ async def test_malformed_messages_are_counted_and_logged_ever_more_rarely(caplog
     assert "what is ?" in caplog.text
 
 
-async def test_what_becomes_of_datagrams_that_are_nobodys_is_the_sessions_to_say(monkeypatch) -> None:
-    def stray(datagram: bytes) -> None:
+class Claimant(Toy, SourceClaims):
+    """Claims ``mine`` from port 11000, and refuses a stray datagram in its peer's name."""
+
+    def claims(self, datagram: bytes, port: int) -> bool:
+        return (datagram, port) == (b"mine", 11000)
+
+    def rivalled(self, now: float) -> None:
+        self.close("rivalled", now)
+
+    def stray(self, datagram: bytes) -> None:
         if datagram == b"in its name":
             raise NotReady("not taken")
 
+
+async def test_what_becomes_of_datagrams_that_are_nobodys_is_the_sessions_to_say() -> None:
     rivals, foreign, refused = Count(), Count(), list[object]()
-    up = Rig(rivals=rivals, foreign=foreign, refused=refused.append).begin()
-    monkeypatch.setattr(up.session, "claims", lambda datagram, port: (datagram, port) == (b"mine", 11000))
+    up = Rig(Claimant, rivals=rivals, foreign=foreign, refused=refused.append).begin()
     assert [up.conversation.claims(b"mine", port) for port in (11000, 11001)] == [True, False]
-    monkeypatch.setattr(up.session, "stray", stray)
     for datagram in (b"somebody's", b"in its name"):
         up.conversation.stray_datagram(datagram)
     assert [str(refusal) for refusal in refused] == ["not taken"]
     up.conversation.foreign_datagram()
     assert (foreign.value, up.session.traffic.foreign) == (1, 1)
-    monkeypatch.setattr(up.session, "rivalled", lambda now: up.session.close("rivalled", now))
     up.conversation.rivalled()
     await up.conversation.ended
     assert (rivals.value, up.session.reason) == (1, "rivalled")
+    nobodys = Rig(rivals=rivals).begin()
+    assert not nobodys.conversation.claims(b"mine", 11000)
+    nobodys.conversation.stray_datagram(b"in its name")
 
 
-async def test_a_session_that_drops_its_source_has_its_link_forget_it_once(up: Rig) -> None:
+async def test_a_session_that_drops_its_source_has_its_link_forget_it_once() -> None:
+    up = Rig(Claimant).begin()
     for drops, dropped in ((False, 0), (True, 1), (False, 1)):
         up.session.drops_source = up.session.drops_source or drops
         up.conversation.pump()
@@ -300,11 +309,14 @@ def raises(*arguments: object) -> None:
 FAULT = r"a fault of the protocol: KeyError: 1 in \S+ \(test_conversation.py:\d+\)"
 
 
-@pytest.mark.parametrize("method", ["opened", "accept", "decode", "on_timer", "timers", "_deliver"])
+@pytest.mark.parametrize("method", ["opened", "accept", "decode", "on_timer", "timers", "deliver"])
 async def test_a_fault_of_the_protocol_ends_the_session_and_its_link_with_the_place(
     method: str, rig: Rig, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(rig.conversation if method.startswith("_") else rig.session, method, raises)
+    if method == "deliver":
+        rig = Rig(deliver=raises)
+    else:
+        monkeypatch.setattr(rig.session, method, raises)
     if method == "on_timer":
         monkeypatch.setattr(rig.session, "timers", lambda: 1.0)
     rig.conversation.attached(rig.link)
@@ -317,15 +329,24 @@ async def test_a_fault_of_the_protocol_ends_the_session_and_its_link_with_the_pl
     assert re.search(FAULT, record.getMessage())
 
 
+async def test_a_link_is_looked_at_again_after_a_write_though_nothing_else_is_due() -> None:
+    begins = list[bool]()
+    up = Rig(stalled=begins.append).begin()
+    up.link.unacknowledged_s = 1e-9  # as at the moment of a write
+    up.conversation.pump()
+    up.link.unacknowledged_s = STALLED_S + 0.01
+    await asyncio.sleep(STALLED_S + 0.01)
+    assert begins == [True]
+
+
 class Slow(Rig):
     """A rig whose receiver takes ``work_s`` for what each read brings."""
 
     def __init__(self, part: float) -> None:
         self.work_s = 0.0
         self.surplus = Count()
-        super().__init__(share=FairShare(part), surplus=self.surplus, clock=self._time)
+        super().__init__(share=FairShare(part), surplus=self.surplus, clock=self._time, deliver=self._deliver)
         self.spent_s = 0.0
-        self.conversation._deliver = self._deliver
 
     def _time(self) -> float:
         return self.loop.time() + getattr(self, "spent_s", 0.0)
@@ -354,14 +375,14 @@ async def test_a_rest_ends_no_pause_that_the_bus_asked_for_and_the_bus_ends_no_r
     slow.begin()
     slow.work_s = BURST_S + 0.01
     slow.conversation.received(b"\x01a")
-    slow.conversation.pause_reading()
+    slow.conversation.reading.pause()
     await asyncio.sleep(0.1)
     assert slow.link.paused
-    slow.conversation.resume_reading()
+    slow.conversation.reading.resume()
     assert not slow.link.paused
     slow.conversation.received(b"\x01a")
-    slow.conversation.pause_reading()
-    slow.conversation.resume_reading()
+    slow.conversation.reading.pause()
+    slow.conversation.reading.resume()
     assert slow.link.paused
     slow.conversation.abandon()
     await asyncio.sleep(1.0)

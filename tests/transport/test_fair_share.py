@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from zbridge.transport.fair_share import BURST_S, FairShare
+from zbridge.transport.reading import BURST_S, FairShare
 
 
 def test_work_within_the_share_is_never_held_up() -> None:

@@ -164,9 +164,9 @@ async def test_a_source_belongs_to_the_link_that_claims_it(script: str, monkeypa
     monkeypatch.setattr(udp, "STRAY_S", 0.0)  # every datagram is looked at, however soon after one that nobody claimed
     parts = dict(line.strip().split(" ", 1) for line in script.strip().splitlines())
     hub, recorders = Hub(), [Recorder(mark.encode()) for mark in parts["links"].split()]
-    links = [FakeLink() for _ in recorders]
-    for link, recorder in zip(links, recorders, strict=True):
-        hub.add(link, "10.0.0.1", recorder)
+    links = [FakeLink(receiver=recorder) for recorder in recorders]
+    for link in links:
+        hub.add(link, "10.0.0.1")
     for act in parts["acts"].split():
         who, _, what = act.partition(":")
         if who.isdigit():
@@ -188,8 +188,8 @@ async def test_a_source_belongs_to_the_link_that_claims_it(script: str, monkeypa
 
 async def test_a_hub_gives_a_source_to_a_link_of_its_own_host_only() -> None:
     hub, near, far = Hub(), Recorder(b"a"), Recorder(b"a")
-    hub.add(FakeLink(), "10.0.0.1", near)
-    hub.add(FakeLink(), "10.0.0.2", far)
+    hub.add(FakeLink(receiver=near), "10.0.0.1")
+    hub.add(FakeLink(receiver=far), "10.0.0.2")
     hub.receive(b"a5", ("10.0.0.2", 11000))
     hub.receive(b"a5", ("10.0.0.3", 11000))
     assert (near.datagrams, far.datagrams, hub.foreign.value) == ([], [b"a5"], 1)
@@ -200,7 +200,7 @@ async def test_a_hub_gives_a_source_to_a_link_of_its_own_host_only() -> None:
 @jumping
 async def test_a_source_that_nobody_claimed_is_not_listened_to_for_a_moment_and_a_flood_costs_little() -> None:
     hub, recorder = Hub(), Recorder(b"a")
-    hub.add(FakeLink(), "10.0.0.1", recorder)
+    hub.add(FakeLink(receiver=recorder), "10.0.0.1")
     for _ in range(1000):
         hub.receive(b"b5", ("10.0.0.1", 1))
     assert (recorder.asked, recorder.stray, hub.foreign.value) == ([1], [b"b5"], 1000)

@@ -28,7 +28,7 @@ from zbridge.bus import Bus, Handle, IncomingQuery
 from zbridge.bus.tls.files import own_certificate, own_name
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
-from zbridge.control.context import Conditions
+from zbridge.control.context import Conditions, Faults, RobotContext
 from zbridge.control.latch_store import LatchStore
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.errors import ZbridgeError, describe
@@ -42,13 +42,14 @@ from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.protocol.kept import Exported
 from zbridge.protocol.session_table import SessionTable
-from zbridge.robot.device import RobotDevice
+from zbridge.robot.connection import LinkSettings
+from zbridge.robot.device import ControlParts, RobotDevice
 from zbridge.robot.observer import Observer
 from zbridge.robot.ownership import Ownership
 from zbridge.robot.settings import DevicePlan
 from zbridge.tasks import together, until
 from zbridge.transport import Parcel, attach, connect
-from zbridge.transport.fair_share import FairShare
+from zbridge.transport.reading import FairShare
 
 log = logging.getLogger("zbridge.app.gateway")
 
@@ -231,7 +232,7 @@ class Gateway:
                 async def begin() -> None:
                     await incoming.part_restored()
                     await claim.resume()
-                    device.restore_latches(store.load())  # one that came last is only in the file
+                    device.enforcer.restore(store.load())  # one that came last is only in the file
 
                 await self._serve(bus, ownership, device, store, begin)
             elif not state.listeners:
@@ -280,28 +281,38 @@ class Gateway:
         near, runtime = self._neighbourhood, self._runtime
         control = self._plan.config.control
         limited = control.rate_hz is not None or control.slew_per_s is not None
+        limits = MotionLimits(control.rate_hz or math.inf, control.slew_per_s or math.inf) if limited else None
         return RobotDevice(
-            plan.make_robot(self.metrics),
-            plan.addresses,
-            protocol=plan.protocol.name,
-            keys=self._keys,
-            bus=bus,
-            authority=Authority(control.lease_s, control.deadman_s, runtime.secret, control.max_age_s, store.load()),
-            limits=MotionLimits(control.rate_hz or math.inf, control.slew_per_s or math.inf) if limited else None,
-            manager=self.sessions,
-            metrics=self.metrics,
-            audit=audit,
-            conditions=self.conditions,
-            idle_stop_s=control.idle_stop_s,
-            share=FairShare(near.part) if near is not None else None,
-            shared_address=plan.shares,
-            connect=partial(connect, buffer=near.buffer if near is not None else None, kernel=runtime.kernel),
-            attach=partial(attach, kernel=runtime.kernel),
-            observer=self._observer,
-            clock=runtime.clock,
-            clock_ns=runtime.clock_ns,
-            raw_ms=runtime.raw_ms,
-            suspended_s=runtime.suspended_s,
-            chance=runtime.chance,
-            keep_latches=store.save,
+            RobotContext(
+                plan.make_robot(self.metrics),
+                self._keys,
+                bus,
+                self.metrics,
+                self.conditions,
+                Faults(self._keys.robot),
+                clock=runtime.clock,
+                clock_ns=runtime.clock_ns,
+                raw_ms=runtime.raw_ms,
+                suspended_s=runtime.suspended_s,
+            ),
+            plan.protocol.name,
+            LinkSettings(
+                addresses=plan.addresses,
+                sessions=self.sessions,
+                connect=partial(connect, buffer=near.buffer if near is not None else None, kernel=runtime.kernel),
+                attach=partial(attach, kernel=runtime.kernel),
+                chance=runtime.chance,
+                share=FairShare(near.part) if near is not None else None,
+                shared=plan.shares,
+            ),
+            ControlParts(
+                authority=Authority(
+                    control.lease_s, control.deadman_s, runtime.secret, control.max_age_s, store.load()
+                ),
+                audit=audit,
+                limits=limits,
+                idle_stop_s=control.idle_stop_s,
+                save=store.save,
+            ),
+            self._observer,
         )

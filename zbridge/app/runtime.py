@@ -21,9 +21,9 @@ from zbridge.app.config import GatewayPlan
 from zbridge.app.handover.processes import PROCESSES, Processes
 from zbridge.app.joining import can_connect, join_bus
 from zbridge.bus import Bus
+from zbridge.clocks import raw_ms, suspended_s
 from zbridge.control.audit_log import Audit, AuditFile
-from zbridge.control.context import Conditions, suspended_s
-from zbridge.lease.lease_holder import raw_ms
+from zbridge.control.context import Conditions
 from zbridge.metrics import Metrics
 from zbridge.transport.kernel import KERNEL, Kernel
 
@@ -32,7 +32,7 @@ class Runtime(msgspec.Struct, frozen=True):
     """The machine below one gateway.
 
     clock: seconds on the time line of event loops, without their rounding. clock_ns: Unix time. raw_ms, suspended_s:
-    see :mod:`zbridge.control.context`. chance: 0 to 1. secret: so many random bytes. folder: where latched stops are
+    see :mod:`zbridge.clocks`. chance: 0 to 1. secret: so many random bytes. folder: where latched stops are
     kept; None: where :func:`zbridge.control.latch_store.state_folder` says. processes: for a restart. join: opens the
     bus, however long that takes. can_connect: whether a second session connects to it.
     """

@@ -74,7 +74,7 @@ class Serving:
     @property
     def state(self) -> str:
         """The state of the robot, as on ``status`` of the gateway that serves it."""
-        return SERVED_ELSEWHERE if self._ownership.yielded else self._device.state
+        return SERVED_ELSEWHERE if self._ownership.yielded else self._device.observed.state
 
     async def run(self, begin: Begin | None = None) -> None:
         """Serve until another gateway or a successor takes the robot over. begin: see :meth:`RobotDevice.run`."""
@@ -114,13 +114,13 @@ class Serving:
             self._conditions.set(_RIVALS, None)
             return
         for claim in claims.values():
-            self._device.merge(claim.record)
+            self._device.enforcer.merge(claim.record)
         self._report(claims)
 
     def merge(self, record: LatchRecord) -> None:
         """Take what a gateway knows that waits for this robot."""
         if not self._ownership.yielded:
-            self._device.merge(record)
+            self._device.enforcer.merge(record)
 
     async def step_aside(self) -> None:
         """Stop the robot, and leave it to the gateway with the better claim."""
@@ -129,7 +129,7 @@ class Serving:
 
     async def step_in(self) -> None:
         """Serve the robot again, with the latched stops of the gateway that served it meanwhile."""
-        self._device.merge(self._owners_record)
+        self._device.enforcer.merge(self._owners_record)
         await self._device.step_in()
         self._open()
 
@@ -164,4 +164,5 @@ class Serving:
             self._logged_at = self._clock()
             log.error("%s: %s", self._robot, text)
             for zid in zids[:_LISTED]:
-                self._device.refuse("claim", Held("this gateway serves the robot"), zid)
+                self._device.enforcer.refuse("claim", Held("this gateway serves the robot"), zid)
+                self._device.enforcer.settle()

@@ -54,7 +54,6 @@ class FakeBus:
 
     @property
     def zid(self) -> str:
-        """The id of this session."""
         return self._zid
 
     def join(self, zid: str) -> FakeBus:

@@ -92,9 +92,10 @@ class Inbox:
         queue = line.popleft()
         queue.listed = False  # before the item is taken: a later item lists the queue again
         try:
-            source, raw = queue.take()
+            source, raw, size = queue.items.popleft()
         except IndexError:  # the queue was listed twice, or its items were dropped
             return
+        queue.taken += size
         if queue.items and not queue.listed:
             queue.listed = True
             line.append(queue)
@@ -127,9 +128,11 @@ class Source:
         """Queue an item of ``size`` bytes for the loop, from any thread; drop and count the oldest if it is full."""
         queue = self._queues[priority]
         while queue.items and (len(queue.items) >= QUEUE or queue.bytes + size > QUEUE_BYTES):
-            queue.forget()
+            with contextlib.suppress(IndexError):  # the loop was quicker
+                queue.forgotten += queue.items.popleft()[2]
             self._dropped.value += 1
-        queue.add(self, raw, size)
+        queue.added += size
+        queue.items.append((self, raw, size))
         self._inbox.line_up(queue, priority)
 
     def fold(self, raw: Any, priority: PriorityClass) -> None:
@@ -138,7 +141,7 @@ class Source:
         if queue.items:
             self._folded.value += 1
         else:
-            queue.add(self, raw, 0)
+            queue.items.append((self, raw, 0))
         self._inbox.line_up(queue, priority)
 
 
@@ -148,26 +151,13 @@ class _Queue:
     def __init__(self) -> None:
         self.listed = False
         self.items: deque[tuple[Source, Any, int]] = deque()
-        self._added = 0
-        self._forgotten = 0
-        self._taken = 0
+        self.added = 0
+        """Bytes that were added, as of the threads that add; so is ``forgotten``."""
+        self.forgotten = 0
+        self.taken = 0
+        """Bytes that were taken, as of the loop's thread."""
 
     @property
     def bytes(self) -> int:
         """Bytes that wait."""
-        return self._added - self._forgotten - self._taken
-
-    def add(self, source: Source, raw: Any, size: int) -> None:
-        self._added += size
-        self.items.append((source, raw, size))
-
-    def forget(self) -> None:
-        """Drop the oldest item, on the thread that adds."""
-        with contextlib.suppress(IndexError):  # the loop was quicker
-            self._forgotten += self.items.popleft()[2]
-
-    def take(self) -> tuple[Source, Any]:
-        """Take the oldest item, on the loop's thread; raise IndexError if there is none."""
-        source, raw, size = self.items.popleft()
-        self._taken += size
-        return source, raw
+        return self.added - self.forgotten - self.taken

@@ -19,7 +19,7 @@ from zbridge.metrics import Metrics
 from zbridge.protocol.address import DeviceAddress
 from zbridge.protocol.plugin import Protocol
 from zbridge.protocol.session import State
-from zbridge.transport import Conversation, Link, connect
+from zbridge.transport import Conversation, ConversationHooks, Link, connect
 
 PROBE_S = 15.0
 """Time limit of a handshake, seconds."""
@@ -76,7 +76,7 @@ async def _talk(protocol: Protocol, address: DeviceAddress) -> int:
             settled.set()
 
     link: Link | None = None
-    conversation = Conversation(session, loop, deliver=lambda messages: None, changed=changed)
+    conversation = Conversation(session, loop, ConversationHooks(changed=changed))
     conversation.ended.add_done_callback(lambda _: settled.set())
     try:
         link = await connect(address, conversation)

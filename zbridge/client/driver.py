@@ -11,6 +11,7 @@ from typing import Any
 
 from zbridge.bus import Bus, Publisher, Sample
 from zbridge.bus.tls.membership import Right, lacking
+from zbridge.clocks import raw_ms
 from zbridge.errors import BusError, BusRefused, Held, LeaseLost, NeutralFirst, PayloadError, Refused
 from zbridge.errors import refusal as refused
 from zbridge.fleet import payload as payloads
@@ -19,7 +20,7 @@ from zbridge.fleet.messages import Acquire, Control, Drive, FleetMessage, Mode, 
 from zbridge.fleet.topics import KeySpace, Topic
 from zbridge.lease.lease_client import RETRY_S, LeaseClient
 from zbridge.lease.lease_events import NAMED, LeaseEvent, LeaseEventKind
-from zbridge.lease.lease_holder import LeaseHolder, raw_ms
+from zbridge.lease.lease_holder import LeaseHolder
 
 __all__ = ["RETRY_S", "Driver", "default_who"]
 

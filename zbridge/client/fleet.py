@@ -14,6 +14,7 @@ from zbridge.client import stops
 from zbridge.client.driver import Driver, default_who
 from zbridge.client.feed import WAITING, WAITING_IMAGES, Feed, StateFeed, reader
 from zbridge.client.stops import Outcome
+from zbridge.clocks import raw_ms
 from zbridge.errors import BusError, Malformed, PayloadError, Refused, refusal
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -41,7 +42,6 @@ from zbridge.fleet.messages import (
     Text,
 )
 from zbridge.fleet.topics import KeySpace, Topic, escape, is_name, split_key, unescape
-from zbridge.lease.lease_holder import raw_ms
 
 T = TypeVar("T")
 

@@ -9,10 +9,10 @@ from collections.abc import Callable
 import msgspec
 
 from zbridge.bus import Bus
+from zbridge.clocks import raw_ms, suspended_s
 from zbridge.errors import FAULT, Unsupported, describe
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import KeySpace, Topic
-from zbridge.lease.lease_holder import raw_ms
 from zbridge.metrics import Metrics
 from zbridge.protocol.plugin import RobotSide
 
@@ -20,18 +20,6 @@ log = logging.getLogger("zbridge.robot.commands")
 
 LOGGED = 16
 """Faults that are logged, each once."""
-_BOOT = getattr(time, "CLOCK_BOOTTIME", None)
-
-
-def suspended_s() -> float:
-    """Return for how many seconds this machine was suspended since it was booted; 0 where the platform does not say.
-
-    The result may be too small by the time between two readings, never too large.
-    """
-    if _BOOT is None:
-        return 0.0
-    since_boot = time.clock_gettime(_BOOT)
-    return since_boot - time.monotonic()
 
 
 class Conditions:
@@ -101,9 +89,9 @@ class RobotContext(msgspec.Struct, frozen=True):
     metrics: Metrics
     conditions: Conditions
     faults: Faults
-    publish: Callable[[Topic, FleetMessage], object]
-    pump: Callable[[], object]
     clock: Callable[[], float]
-    clock_ns: Callable[[], int]
+    clock_ns: Callable[[], int] = time.time_ns
     raw_ms: Callable[[], float] = raw_ms
     suspended_s: Callable[[], float] = suspended_s
+    publish: Callable[[Topic, FleetMessage], object] = lambda topic, message: None
+    pump: Callable[[], object] = lambda: None

@@ -67,7 +67,7 @@ class Enforcer:
         self._standstill = standstill
         self._audit = audit
         self._limits = limits
-        self.settled: Callable[..., object] = lambda *, at_once: None
+        self.settled: Callable[..., object] | None = None
         """Called after :meth:`settle`: whether the robot is driven, or (``at_once``) how it is stopped, may be new."""
         self._stops_anew = False
         """Whether a command has just changed how the robot is stopped."""
@@ -202,7 +202,8 @@ class Enforcer:
         if deadline is not None and deadline < self._timer_at:
             self._arm(deadline)
         stops_anew, self._stops_anew = self._stops_anew, False
-        self.settled(at_once=stops_anew)
+        if self.settled is not None:
+            self.settled(at_once=stops_anew)
 
     def keep_time(self) -> None:
         """Do what is due, before anything is read or written: the process may have been frozen, the machine asleep."""

@@ -39,7 +39,8 @@ from zbridge.host.fd_channel import (
 )
 from zbridge.host.memory import DEPOSIT_BYTES, PARTIAL_BYTES, SLOTS, MemoryWriter, slot_of
 from zbridge.protocol.kept import Budget
-from zbridge.robot.observer import LastStop, Observed, Resume
+from zbridge.robot.connection import Resume
+from zbridge.robot.observer import LastStop, ObservedRobot, Observer
 from zbridge.transport import Link, Parcel
 
 log = logging.getLogger("zbridge.host")
@@ -75,7 +76,7 @@ class _Listed(Parcel):
         return len(self.descriptors) - 1
 
 
-class Reporter:
+class Reporter(Observer):
     """The gateway's end of the channel; an observer of its robot. To be begun on the event loop.
 
     hands_over: whether the gateway hands over its sockets when it is sent SIGUSR2.
@@ -84,7 +85,7 @@ class Reporter:
     def __init__(self, channel: FdChannel, *, hands_over: bool = False) -> None:
         self._channel = channel
         self._hands_over = hands_over
-        self._device: Observed | None = None
+        self._device: ObservedRobot | None = None
         self._links: dict[Link, tuple[int, str, tuple[int, ...]]] = {}
         """Number, name and reported descriptors of each link that is up."""
         self._numbers = 0
@@ -149,7 +150,7 @@ class Reporter:
 
     # The observer
 
-    def began(self, device: Observed) -> None:
+    def began(self, device: ObservedRobot) -> None:
         """Start: the device serves its robot. What this process deposits counts from now on, even if it is nothing."""
         self._device = device
         self._deposit(first=True)

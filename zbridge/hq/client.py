@@ -23,7 +23,7 @@ from zbridge.hq.robot_queries import RobotQueries
 from zbridge.protocol.kept import Exported
 from zbridge.protocol.plugin import Send, Telemetry
 from zbridge.protocol.session import Session, State
-from zbridge.transport import Conversation, Parcel
+from zbridge.transport import ClientConversation, Conversation, ConversationHooks, Parcel
 
 STALL_S = 5.0
 """Seconds without taking what is written after which a client is closed; seconds of taking it count against them."""
@@ -109,7 +109,7 @@ class Client:
     @property
     def silent_s(self) -> float:
         """Seconds for which the program's machine has owed an acknowledgement."""
-        return self.conversation.silent_s
+        return self.conversation.link.silent_s if self.conversation.link is not None else 0.0
 
     def repeat(self) -> None:
         """Send the robot again what the program has in motion."""
@@ -140,7 +140,7 @@ class Client:
         """Be the client that another process served: its session is restored. It owes neutral."""
         self.begun = bool(state["begun"])
         self.operator.restore(state["operator"], why)
-        self.conversation.suspended = True
+        self.conversation.reading.suspended = True
 
     def resume(self) -> None:
         """Read and write; carry out what the side keeps of this client in its time."""
@@ -276,9 +276,7 @@ class Client:
 
     def _make_conversation(self) -> Conversation:
         context = self._context
-        return Conversation(
-            self.session,
-            self._loop,
+        hooks = ConversationHooks(
             deliver=self._on_messages,
             changed=self._on_session,
             malformed=context.counts.malformed,
@@ -288,3 +286,4 @@ class Client:
             may_warn=lambda kind: context.connections.first(self.host, kind, context.clock()),
             clock=context.clock,
         )
+        return ClientConversation(self.session, self._loop, hooks)

@@ -19,7 +19,7 @@ from zbridge.hq.context import ListenerContext
 from zbridge.protocol.kept import Exported
 from zbridge.protocol.session import Session
 from zbridge.protocol.session_table import ClientIds
-from zbridge.transport import Accepted, Conversation, Door, Link, Parcel, Transferable
+from zbridge.transport import Door, Parcel, Transferable
 
 RESTARTED = "gateway restarted"
 """Why clients lose the robot, and must send neutral."""
@@ -106,7 +106,7 @@ class ListenerHandover(Transferable):
         left = [client for client in self._clients.values() if client.conversation.blocker is not None]
         for client in tuple(self._clients.values()):
             if client in left:
-                client.conversation.suspended = False
+                client.conversation.reading.suspended = False
                 client.conversation.close(RESTARTED)
             else:
                 client.detach()
@@ -150,7 +150,7 @@ class ListenerHandover(Transferable):
         restored, self._restored = self._restored, []
         for client, number, source in restored:
             try:
-                await self._door.admit(number, Accepted(_attached(client.conversation)), source)
+                await self._door.admit(number, client.conversation, source)
             except (OSError, ProtocolError) as error:
                 client.conversation.lost(str(error))
         await self._door.open()
@@ -160,7 +160,3 @@ def _blocker(client: Client) -> str | None:
     """Return why a client that could be handed over cannot be yet."""
     link = client.conversation.link
     return client.blocker if link is not None and link.blocker is None and not client.session.over else None
-
-
-def _attached(conversation: Conversation) -> Callable[[Link], Conversation]:
-    return lambda link: conversation

@@ -13,7 +13,7 @@ import logging
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from zbridge.control.context import suspended_s
+from zbridge.clocks import raw_ms, suspended_s
 from zbridge.hq.admission import FULL, Admission
 from zbridge.hq.bridge import Bridge
 from zbridge.hq.broadcast import Broadcast
@@ -26,7 +26,6 @@ from zbridge.hq.refusals import RefusalReports
 from zbridge.hq.robot_queries import RobotQueries
 from zbridge.hq.robot_subscription import RobotSubscription
 from zbridge.hq.settings import ListenerPlan
-from zbridge.lease.lease_holder import raw_ms
 from zbridge.metrics import Metrics
 from zbridge.protocol.kept import Exported
 from zbridge.protocol.plugin import ATTEND_S
@@ -104,7 +103,7 @@ class Listener:
         self._broadcast.begin()
         async with listen(
             self.address,
-            lambda: Accepted(self._admit, logging.DEBUG),  # the end of a client is logged with its reason
+            lambda: Accepted(self._admit),
             datagrams=self._context.side.datagrams,
             foreign=self._context.counts.foreign_datagrams,
             secured=self._secured,

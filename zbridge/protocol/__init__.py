@@ -9,7 +9,8 @@ plugin          :class:`Protocol`: what an entry point names. :class:`RobotSide`
                 side may do for a client every ``ATTEND_S`` seconds.
                 :class:`Simulation`, :class:`HqSimulation`: how its simulators are started.
 session         :class:`Session`: one conversation, in a :class:`Role`, within :class:`Limits`, in a :class:`State`,
-                with its :class:`Traffic`; a :class:`Datagram` is a frame that goes by UDP.
+                with its :class:`Traffic`; a :class:`Datagram` is a frame that goes by UDP, and a session with
+                :class:`SourceClaims` says which of them are its peer's.
 session_table   :class:`ClientIds`: the ids that a robot gives its clients.
 outbox          :class:`Outbox`: what a session still has to write; ``LIMIT`` frames may wait.
 negotiation     :func:`agree`, :func:`newest`, :func:`parse_versions`: which version both sides speak.
@@ -82,6 +83,7 @@ from zbridge.protocol.samples import (
 )
 from zbridge.protocol.session import Datagram, Limits, Role, Session, State, Traffic
 from zbridge.protocol.session_table import ClientIds
+from zbridge.protocol.traffic import SourceClaims
 
 __all__ = [
     "ATTEND_S",
@@ -131,6 +133,7 @@ __all__ = [
     "Send",
     "Session",
     "Simulation",
+    "SourceClaims",
     "Spare",
     "State",
     "Telemetry",

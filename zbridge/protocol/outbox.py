@@ -27,6 +27,8 @@ import math
 from collections import deque
 from typing import Any, ClassVar
 
+import msgspec
+
 from zbridge.errors import Code, NotReady
 from zbridge.protocol.kept import FRAMES, Form, Kept, Spare
 
@@ -36,20 +38,15 @@ LIMIT = 64
 """Frames that may wait; one more is refused."""
 
 
-class _Group:
+class _Group(msgspec.Struct):
     """The frames of one slot: sent ``spacing_s`` apart, then again every ``period_s`` until ``until``."""
 
-    __slots__ = ("due", "frames", "period_s", "position", "spacing_s", "until")
-
-    def __init__(
-        self, frames: tuple[bytes, ...], due: float, period_s: float, until: float, spacing_s: float = 0.0
-    ) -> None:
-        self.frames = frames
-        self.position = 0
-        self.due = due
-        self.period_s = period_s
-        self.until = until
-        self.spacing_s = spacing_s
+    frames: tuple[bytes, ...]
+    due: float
+    period_s: float
+    until: float
+    spacing_s: float = 0.0
+    position: int = 0
 
     def step(self, now: float) -> bytes:
         """Return the next frame of the group."""
@@ -208,8 +205,17 @@ class Outbox(Kept):
             frame: bytes | None = self._exempt.popleft()
         elif now < self._quiet_until:
             return None
+        elif self._urgent:
+            frame = self._urgent.popleft()
+        elif (slot := self._due_slot(now)) is None:
+            self._turn_of_queue = False
+            frame = self._queue.popleft() if self._queue else None
         else:
-            frame = self._urgent.popleft() if self._urgent else self._next(now)
+            self._turn_of_queue = True
+            group = self._slots[slot]
+            frame = group.step(now)
+            if group.over:
+                del self._slots[slot]
         if frame is not None:
             self._free_at = now + self.gap_s
         return frame
@@ -217,18 +223,6 @@ class Outbox(Kept):
     def written(self, now: float) -> None:
         """Start the gap now: the frame taken last is written."""
         self._free_at = max(self._free_at, now + self.gap_s)
-
-    def _next(self, now: float) -> bytes | None:
-        slot = self._due_slot(now)
-        if slot is None:
-            self._turn_of_queue = False
-            return self._queue.popleft() if self._queue else None
-        group = self._slots[slot]
-        frame = group.step(now)
-        if group.over:
-            del self._slots[slot]
-        self._turn_of_queue = True
-        return frame
 
     def deadline(self) -> float | None:
         """Return the time at which :meth:`take` has a frame; None: all queues and slots are empty."""
@@ -240,11 +234,6 @@ class Outbox(Kept):
         if not self._slots:
             return None
         return max(free_at, min(group.due for group in self._slots.values()))
-
-    def due(self, now: float) -> bool:
-        """Return whether :meth:`take` may have a frame now."""
-        at = self.deadline()
-        return at is not None and at <= now
 
     def _hurries(self, group: tuple[bytes, ...]) -> bool:
         """Return whether a group still waits among the urgent frames, whole and in its order."""
@@ -276,6 +265,5 @@ def _write_slots(slots: dict[str, _Group]) -> list[Any]:
 def _read_slots(raw: list[Any]) -> dict[str, _Group]:
     slots = {}
     for slot, frames, position, due, period_s, until, spacing_s in raw:
-        group = slots[slot] = _Group(FRAMES.read(frames), due, period_s, until, spacing_s)
-        group.position = position
+        slots[slot] = _Group(FRAMES.read(frames), due, period_s, until, spacing_s, position)
     return slots

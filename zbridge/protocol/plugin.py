@@ -54,15 +54,12 @@ class RobotSide(Kept, ABC):
     """Whether a robot with two connections obeys one as before when the other is closed; most legacy ones do not."""
     link_names: tuple[str, ...]
     """One name for each configured address, in the order of the configuration; the first link drives the robot."""
+    driving: Session[Any] | None = None
+    """The session that takes drive commands; None before the first connection."""
 
     @abstractmethod
     def session(self, link: str, peer: str) -> Session[Any]:
         """Make the session for a new connection of the link of this name; ``peer``: its address, for logs."""
-
-    @property
-    @abstractmethod
-    def driving(self) -> Session[Any] | None:
-        """The session that takes drive commands; None before the first connection."""
 
     @abstractmethod
     def translator(self, kind: type) -> Translate:

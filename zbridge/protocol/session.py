@@ -19,21 +19,21 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable
 from enum import Enum
-from typing import Any, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import msgspec
 
 from zbridge.errors import EncodeError, ProtocolError, Refused
 from zbridge.fleet.messages import SessionEntry
+from zbridge.protocol.kept import Budget, Exported, Kept
 from zbridge.protocol.outbox import Outbox
 from zbridge.protocol.rate_limit import RateLimit
-from zbridge.protocol.session_kept import KeptSession
 from zbridge.protocol.session_states import TRANSITIONS, SessionAction, SessionEvent
 from zbridge.protocol.session_states import State as State
 from zbridge.protocol.traffic import Datagram as Datagram
 from zbridge.protocol.traffic import Limits as Limits
 from zbridge.protocol.traffic import Traffic as Traffic
-from zbridge.wire.frames import FrameBuffer, FrameEnd
+from zbridge.wire.frames import FrameBuffer, FrameEnd, Partial
 
 M = TypeVar("M")
 
@@ -44,6 +44,12 @@ LINGER_S = 0.5
 """Seconds that a closing session waits for its last frames to be written."""
 DOUBTS = 2
 """Doubts about a connection that together forbid motion; one alone may be an accident."""
+
+
+PARTIAL = "partial"
+"""The name of the incomplete frame in a state."""
+SKIPPED = "the rest of a frame whose beginning was lost with a gateway"
+"""What a session counts among what it left out."""
 
 
 class Role(Enum):
@@ -57,15 +63,28 @@ _ESTABLISHED, _CLOSING, _CLOSED = State.ESTABLISHED, State.CLOSING, State.CLOSED
 """Every message is compared with these; looking them up in the class is slow in Python 3.11."""
 
 
-class Session(KeptSession, ABC, Generic[M]):
+class Session(Kept, ABC, Generic[M]):
     """One conversation; a protocol subclasses it once for each role it plays."""
 
+    kept: ClassVar[dict[str, Any]] = {
+        "state": State,
+        "reason": str | None,
+        "busy": str | None,
+        "doubts": tuple[str, ...],
+        "version": str | None,
+        "features": tuple[str, ...],
+        "transport": str,
+        "traffic": Traffic,
+        "left_out": dict[str, int],
+        "last_malformed": str | None,
+        "outbox": Outbox,
+        "_limit_at": float,
+        "_allowance": RateLimit,
+    }
     role: Role
     frame_end: FrameEnd
     handled: frozenset[type] = frozenset()
     """Message classes that go to ``accept`` after the handshake too."""
-    drops_source = False
-    """Set by a protocol when the source of datagrams is not the peer; the driver forgets the source and clears it."""
 
     def __init__(self, limits: Limits, *, name: str = "", peer: str = "") -> None:
         self.limits = limits
@@ -110,16 +129,6 @@ class Session(KeptSession, ABC, Generic[M]):
     def accept(self, message: M, now: float) -> bool:
         """Handle a message of the handshake, or of a class in ``handled``; True passes it on to the translator."""
 
-    def claims(self, datagram: bytes, port: int) -> bool:
-        """Return whether a datagram from a port of the peer's host that is nobody's source yet is from the peer."""
-        return False
-
-    def rivalled(self, now: float) -> None:
-        """React to a second source, or session, with the same claim; the peer has no source of datagrams any more."""
-
-    def stray(self, datagram: bytes) -> None:
-        """Inspect a datagram of the peer's host that nobody claimed; raise Refused to notify the peer."""
-
     def timers(self) -> float:
         """Return the time of the next :meth:`on_timer`; ``inf``: never."""
         return math.inf
@@ -149,7 +158,7 @@ class Session(KeptSession, ABC, Generic[M]):
             return messages
         traffic, decode, tap, handled = self.traffic, self.decode, self.tap, self.handled
         traffic.bytes_in += len(data)
-        frames, allowed = 0, self._allowance.fill(now)
+        frames, allowed = 0, self._allowance.fill(now) if self._allowance.rate_hz < math.inf else math.inf
         try:
             for frame in self._frames.feed(data):
                 frames += 1
@@ -305,6 +314,35 @@ class Session(KeptSession, ABC, Generic[M]):
             counters=msgspec.structs.asdict(self.traffic),
             left_out=dict(self.left_out),
         )
+
+    # A restart of the gateway
+
+    def export(self, budget: Budget | None = None) -> Exported:
+        """Write the state, with the incomplete frame.
+
+        A deposit has no incomplete frame: it changes with every read, and who watches the reads adds it
+        (:meth:`partial`).
+        """
+        state = super().export(budget)
+        return state | {PARTIAL: list(self._frames.partial() or ())} if budget is None else state
+
+    def partial(self, most_bytes: int) -> Partial | None:
+        """Describe the incomplete frame in ``most_bytes`` at most; None where that is not possible."""
+        return self._frames.partial(most_bytes)
+
+    def restore(self, state: Exported) -> None:
+        """Take over the state of the same session of another process; raise ProtocolError if it has another form.
+
+        To be called in place of :meth:`open`, on a session that was just made from the same settings.
+        """
+        super().restore(state)
+        try:
+            partial = Partial(*msgspec.convert(state.get(PARTIAL, (b"", 0)), tuple[bytes, int]))
+        except msgspec.ValidationError as error:
+            raise ProtocolError(f"incomplete frame: {error}") from error
+        self._frames.resume(partial)
+        if partial.skip:
+            self.left_out[SKIPPED] += 1
 
     # The table, executed
 

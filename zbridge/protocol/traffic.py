@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 
 import msgspec
 
@@ -23,6 +24,25 @@ class Limits(msgspec.Struct, frozen=True):
 
 class Datagram(Frame):
     """A frame that goes by datagram; every other frame goes by the stream."""
+
+
+class SourceClaims(ABC):
+    """What a session tells of datagrams where it is one of several: which of its host's sources is its peer's."""
+
+    drops_source = False
+    """Set when the source turns out not to be the peer; the driver forgets the source and clears it."""
+
+    @abstractmethod
+    def claims(self, datagram: bytes, port: int) -> bool:
+        """Tell whether a datagram from a port of the peer's host that is nobody's source yet is from the peer."""
+
+    @abstractmethod
+    def rivalled(self, now: float) -> None:
+        """React to a second source, or session, with the same claim; the peer has no source of datagrams any more."""
+
+    @abstractmethod
+    def stray(self, datagram: bytes) -> None:
+        """Look at a datagram of the peer's host that nobody claimed; raise Refused to tell the peer why."""
 
 
 class Traffic(msgspec.Struct):

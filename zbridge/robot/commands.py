@@ -165,7 +165,7 @@ class Commands:
             self._awaiting = None
         try:
             session = self.require_ready()
-            if moving:
+            if moving and session.doubts:
                 _require_sure(session)
         except Refused as refusal:
             if moving:

@@ -9,20 +9,21 @@ import asyncio
 import logging
 import random
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import msgspec
 
 from zbridge.errors import LinkError, ProtocolError
 from zbridge.fleet.messages import LinkStatus, RobotState
-from zbridge.metrics import Count
 from zbridge.protocol.address import DeviceAddress
 from zbridge.protocol.kept import Budget, Exported
 from zbridge.protocol.session import Session, State
 from zbridge.protocol.session_table import Backoff, SessionTable
 from zbridge.robot.wire_tap import WireTap
-from zbridge.transport import Conversation, Link, Parcel, attach
-from zbridge.transport.fair_share import FairShare
+from zbridge.transport import Conversation, ConversationHooks, Link, Parcel, attach, connect
+from zbridge.transport.reading import FairShare
+from zbridge.wire.frames import Partial
 
 log = logging.getLogger("zbridge.link")
 
@@ -30,6 +31,8 @@ Connect = Callable[[DeviceAddress, Conversation], Any]
 """``await connect(address, receiver)``: raises LinkError if there is no connection to be had."""
 Attach = Callable[[DeviceAddress, Exported, Parcel, Conversation], Any]
 """``await attach(address, state, parcel, receiver)``: raises ProtocolError, OSError."""
+Resume = Callable[[int], Partial | None]
+"""``resume(most_bytes)``: the incomplete frame of a stream, by :meth:`zbridge.wire.frames.FrameBuffer.partial`."""
 
 _STATES: dict[State, RobotState] = {
     State.CONNECTING: "connecting",
@@ -40,35 +43,35 @@ _STATES: dict[State, RobotState] = {
 }
 
 
-class Hooks(msgspec.Struct, frozen=True):
-    """What a connection is given by the device it belongs to."""
+class LinkSettings(msgspec.Struct, frozen=True, kw_only=True):
+    """How the links of one robot are made."""
 
-    session: Callable[[], Session[Any]]
-    deliver: Callable[[list[Any]], None]
-    session_changed: Callable[[Session[Any]], None]
-    state_changed: Callable[[], None]
-    connect: Connect
-    manager: SessionTable
-    malformed: Count
-    foreign: Count
-    clock: Callable[[], float]
-    before: Callable[[], object] = lambda: None
-    """Called before a frame is written: a stop may have to be written first."""
-    share: FairShare | None = None
-    """Of the processor, where the process serves other robots too."""
-    surplus: Count | None = None
-    """Counts datagrams beyond the share."""
-    stalled: Callable[[bool], object] = lambda stalled: None
-    """Called when the link stops taking bytes (True), and when it takes them again (False)."""
-    linked: Callable[[Link, bool], object] = lambda link, up: None
-    """Called when a link is up (True), and when it is gone (False)."""
-    read: Callable[[], object] = lambda: None
-    """Called when the bytes of a read have been handled."""
+    addresses: tuple[DeviceAddress, ...]
+    """One for each link."""
+    sessions: SessionTable
+    connect: Connect = connect
     attach: Attach = attach
+    """Attaches a connection that another process handed over."""
     chance: Callable[[], float] = random.random
     """Between 0 and 1."""
+    share: FairShare | None = None
+    """Of the processor, where the process serves other robots too."""
     shared: bool = False
-    """Whether gateways of other robots may connect to the same address."""
+    """Whether gateways of other robots may connect to the same addresses."""
+
+
+class LinkHooks(msgspec.Struct, frozen=True):
+    """What the connections of one robot call; the first argument of most is the name of the link."""
+
+    session: Callable[[str, str], Session[Any]]
+    """``session(name, address)``: makes the session of a new connection."""
+    session_changed: Callable[[Session[Any]], None]
+    state_changed: Callable[[], None]
+    stalled: Callable[[str, bool], object]
+    linked: Callable[[str, Link, bool], object]
+    read: Callable[[str, Resume], object] | None
+    conversation: ConversationHooks
+    """Those that all conversations share."""
 
 
 class Links:
@@ -106,25 +109,26 @@ class Links:
         """Read nothing until :meth:`resume_reading`."""
         for connection in self._connections:
             if connection.conversation is not None:
-                connection.conversation.pause_reading()
+                connection.conversation.reading.pause()
 
     def resume_reading(self) -> None:
         """Read again."""
         for connection in self._connections:
             if connection.conversation is not None:
-                connection.conversation.resume_reading()
+                connection.conversation.reading.resume()
 
 
 class Connection:
     """One configured address, its conversation while there is one, and who watches its frames."""
 
-    def __init__(self, name: str, label: str, address: DeviceAddress, hooks: Hooks) -> None:
+    def __init__(self, name: str, label: str, address: DeviceAddress, settings: LinkSettings, hooks: LinkHooks) -> None:
         self.name = name
         self._label = label
         self.address = address
         self.state: RobotState = "offline"
         self.reason: str | None = "not yet connected"
         self.conversation: Conversation | None = None
+        self._settings = settings
         self._hooks = hooks
         self._ending = False
         self._link: Link | None = None
@@ -136,14 +140,15 @@ class Connection:
         self._restored: tuple[Exported, Parcel] | None = None
         """The link of another process, until it is attached."""
         self._muted = False
-        self._wire = WireTap(label)
+        self.wire = WireTap(label)
+        """Shows the raw frames."""
 
     def __repr__(self) -> str:
         return f"<Connection {self.name} {self.address} {self.state}>"
 
     async def run(self) -> None:
         """Connect, converse and connect again, until :meth:`close`."""
-        backoff = Backoff(chance=self._hooks.chance)
+        backoff = Backoff(chance=self._settings.chance)
         while not self._ending:
             reason, established = await self._converse()
             if established:
@@ -209,7 +214,7 @@ class Connection:
         self.conversation.resume()
         if restored is not None:
             try:
-                await self._hooks.attach(self.address, *restored, self.conversation)
+                await self._settings.attach(self.address, *restored, self.conversation)
             except (OSError, ProtocolError) as error:
                 self.conversation.lost(str(error))
 
@@ -221,11 +226,11 @@ class Connection:
         """Restore the conversation of another process, which :meth:`resume` attaches; raise ProtocolError."""
         if state is None:
             return
-        session = self._hooks.session()
+        session = self._new_session()
         session.restore(state["session"])
         self.state, self.reason = _STATES[session.state], session.busy or session.reason
         self.conversation = conversation = self._make_conversation(session)
-        conversation.suspended, conversation.connected_at = True, state["connected_at"]
+        conversation.reading.suspended, conversation.connected_at = True, state["connected_at"]
         self._restored = (state["link"], parcel)
 
     def detach(self) -> None:
@@ -236,54 +241,46 @@ class Connection:
 
     def status(self) -> LinkStatus:
         """Return the entry of this link on ``status``."""
-        peer, shared = str(self.address), self._hooks.shared or msgspec.UNSET
+        peer, shared = str(self.address), self._settings.shared or msgspec.UNSET
         return LinkStatus(name=self.name, state=self.state, peer=peer, reason=self.reason, shared=shared)
-
-    def watch(self, direction: str, show: Callable[[bytes], object] | None) -> None:
-        """Show the raw frames of one direction (``in`` or ``out``), those of the handshake first; None: show none."""
-        self._wire.watch(direction, show)
 
     async def _converse(self) -> tuple[str, bool]:
         """Hold one conversation to its end; return why it ended and whether it was ever established."""
-        hooks, conversation = self._hooks, self.conversation
+        settings, conversation = self._settings, self.conversation
         restored = conversation is not None
         if conversation is None:
             self._set_state("connecting", None)
-            conversation = self.conversation = self._make_conversation(hooks.session())
+            conversation = self.conversation = self._make_conversation(self._new_session())
         session = conversation.session
-        hooks.manager.add(session)
+        settings.sessions.add(session)
         try:
             if not restored:
-                self._link = await hooks.connect(self.address, conversation)
+                self._link = await settings.connect(self.address, conversation)
             await conversation.ended
         except LinkError as error:
             session.lost(str(error))
         finally:
             conversation.abandon()
             self.conversation = None
-            hooks.manager.remove(session)
+            settings.sessions.remove(session)
         return session.reason or "closed", session.version is not None
 
+    def _new_session(self) -> Session[Any]:
+        return self._hooks.session(self.name, str(self.address))
+
     def _make_conversation(self, session: Session[Any]) -> Conversation:
-        hooks = self._hooks
-        session.name = self.name
+        name, hooks = self.name, self._hooks
+        session.name = name
         session.outbox.mute(self._muted)
-        self._wire.begin(session)
-        return Conversation(
-            session,
-            asyncio.get_running_loop(),
-            deliver=hooks.deliver,
-            changed=lambda: self._on_session(session),
-            malformed=hooks.malformed,
-            foreign=hooks.foreign,
-            clock=hooks.clock,
-            before=hooks.before,
-            stalled=hooks.stalled,
-            share=hooks.share,
-            surplus=hooks.surplus,
-            linked=hooks.linked,
-            read=hooks.read,
+        self.wire.begin(session)
+        own = msgspec.structs.replace(
+            hooks.conversation,
+            changed=partial(self._on_session, session),
+            stalled=partial(hooks.stalled, name),
+            linked=partial(hooks.linked, name),
+            read=partial(hooks.read, name, session.partial) if hooks.read is not None else None,
         )
+        return Conversation(session, asyncio.get_running_loop(), own)
 
     def _on_session(self, session: Session[Any]) -> None:
         if session.state is State.ESTABLISHED and self.state != "established":

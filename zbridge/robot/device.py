@@ -8,45 +8,33 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import random
-import time
 from collections.abc import Awaitable, Callable, Sequence
-from functools import partial
 from typing import Any
 
 import msgspec
 
-from zbridge.bus import Bus, Handle
+from zbridge.bus import Handle
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
-from zbridge.control.context import Conditions, Faults, RobotContext, suspended_s
+from zbridge.control.context import RobotContext
 from zbridge.control.enforcer import Enforcer, Save
-from zbridge.control.latch import Latches, LatchRecord
 from zbridge.control.lease_server import LeaseServer
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import IDLE_STOP_S, STOP_REPEAT_S, Standstill
 from zbridge.errors import BusError, NotReady, Refused, Unsupported
-from zbridge.fleet.topics import KeySpace
-from zbridge.lease.lease_holder import raw_ms
-from zbridge.metrics import Metrics
-from zbridge.protocol.address import DeviceAddress
 from zbridge.protocol.kept import Budget, Exported
-from zbridge.protocol.plugin import RobotSide
-from zbridge.protocol.session import Datagram, Session, State
-from zbridge.protocol.session_kept import PARTIAL
-from zbridge.protocol.session_table import SessionTable
+from zbridge.protocol.session import PARTIAL, Session, State
 from zbridge.robot.claim import Standing
 from zbridge.robot.commands import Commands
-from zbridge.robot.connection import Attach, Connect, Connection, Hooks, Links
+from zbridge.robot.connection import Connection, LinkHooks, Links, LinkSettings
 from zbridge.robot.fleet_latches import FleetLatchNews
-from zbridge.robot.observer import Boundary, LastStop, Nobody, Observer, StopFrame
+from zbridge.robot.observer import ObservedRobot, Observer
 from zbridge.robot.on_demand import OnDemand
 from zbridge.robot.presence import Presence
 from zbridge.robot.publishers import RobotPublishers
 from zbridge.robot.queries import PendingQueries, Queries
 from zbridge.robot.telemetry import Telemetry
-from zbridge.transport import Parcel, Transferable, attach, connect
-from zbridge.transport.fair_share import FairShare
+from zbridge.transport import ConversationHooks, Parcel, Transferable
 from zbridge.wire.frames import Partial
 
 HEARD_S = 3.0
@@ -67,42 +55,30 @@ _LOOK_S = 0.005
 """Seconds between two looks whether the links can be handed over."""
 
 
+class ControlParts(msgspec.Struct, frozen=True, kw_only=True):
+    """What decides over the motion of one robot.
+
+    limits: None where drives are not limited. idle_stop_s: see :class:`Standstill`. save: see :class:`Enforcer`.
+    """
+
+    authority: Authority
+    audit: Audit
+    limits: MotionLimits | None = None
+    idle_stop_s: float = IDLE_STOP_S
+    save: Save = lambda latches: None
+
+
 class RobotDevice(Transferable):
-    """One robot on the bus; ``run`` serves it. addresses: one for each of the robot's links."""
+    """One robot on the bus; ``run`` serves it. protocol: the name that ``status`` shows."""
 
     def __init__(
         self,
-        robot: RobotSide,
-        addresses: tuple[DeviceAddress, ...],
-        *,
+        context: RobotContext,
         protocol: str,
-        keys: KeySpace,
-        bus: Bus,
-        authority: Authority,
-        manager: SessionTable,
-        metrics: Metrics,
-        audit: Audit,
-        limits: MotionLimits | None = None,
-        conditions: Conditions | None = None,
-        idle_stop_s: float = IDLE_STOP_S,
-        share: FairShare | None = None,
-        shared_address: bool = False,
-        connect: Connect = connect,
+        settings: LinkSettings,
+        control: ControlParts,
         observer: Observer | None = None,
-        clock: Callable[[], float] | None = None,
-        clock_ns: Callable[[], int] = time.time_ns,
-        raw_ms: Callable[[], float] = raw_ms,
-        suspended_s: Callable[[], float] = suspended_s,
-        keep_latches: Save = lambda latches: None,
-        chance: Callable[[], float] = random.random,
-        attach: Attach = attach,
     ) -> None:
-        """Begin. share: of the processor, where the process serves other robots too.
-
-        shared_address: gateways of other robots may connect to the same addresses. clock: seconds on the event loop's
-        time line. clock_ns: Unix time. raw_ms, suspended_s: see :mod:`zbridge.control.context`. keep_latches: writes
-        the latched stops down. chance: 0 to 1. attach: attaches a connection that another process handed over.
-        """
         loop = asyncio.get_running_loop()
         self._protocol = protocol
         self._detached = asyncio.Event()
@@ -111,66 +87,55 @@ class RobotDevice(Transferable):
         self._commanded: list[Handle] = []
         self._declared: list[Handle] = []
         self._on_demand: list[OnDemand] = []
-        self._aside = False
-        """Whether another gateway serves the robot, while this one's connection is kept."""
-        clock, conditions = clock or loop.time, conditions or Conditions()
-        self._share = share
-        self._shared_address = shared_address
-        self._observer = observer or Nobody()
-        self._publishers = publishers = RobotPublishers(bus, keys, conditions, clock, self._observer.published)
+        self._observer = watching = observer or Observer()
+        bus, keys, conditions = context.bus, context.keys, context.conditions
+        self._publishers = RobotPublishers(bus, keys, conditions, context.clock, watching.published)
         self._links = links = Links()
-        self._context = context = RobotContext(
-            robot,
-            keys,
-            bus,
-            metrics,
-            conditions,
-            Faults(keys.robot),
-            publishers.publish,
-            links.pump,
-            clock,
-            clock_ns,
-            raw_ms,
-            suspended_s,
-        )
+        publish = self._publishers.publish
+        self._context = context = msgspec.structs.replace(context, publish=publish, pump=links.pump)
         self._pending = pending = PendingQueries(loop)
-        self._standstill = Standstill(context, authority, idle_stop_s)
-        self._enforcer = Enforcer(context, authority, self._standstill, audit, limits, keep_latches)
-        self._enforcer.settled = self._observer.changed
-        self._leases = LeaseServer(context, self._enforcer)
-        self._latch_news = FleetLatchNews(bus, keys, self._enforcer, self._leases, chance)
-        self._commands = Commands(context, self._enforcer)
+        self._standstill = Standstill(context, control.authority, control.idle_stop_s)
+        self.enforcer = enforcer = Enforcer(
+            context, control.authority, self._standstill, control.audit, control.limits, control.save
+        )
+        enforcer.settled = observer.changed if observer is not None else None
+        self.observed = ObservedRobot(context, links, control.authority)
+        self._leases = LeaseServer(context, enforcer)
+        self._latch_news = FleetLatchNews(bus, keys, enforcer, self._leases, settings.chance)
+        self._commands = Commands(context, enforcer)
         self._queries = Queries(context, self._commands, pending)
         self._telemetry = Telemetry(context, self._publishers, pending, links)
-        self._presence = Presence(context, protocol, links, self._enforcer, self._standstill, self._commands, pending)
+        self._presence = Presence(
+            context, protocol, links, enforcer, self._standstill, self._commands, pending, watching
+        )
         conditions.changed = self._presence.publish_status
-        for name, address in zip(robot.link_names, addresses, strict=True):
-            hooks = msgspec.structs.replace(self._hooks(name, address, connect, manager), attach=attach, chance=chance)
-            links.add(Connection(name, f"{keys.robot} {name}", address, hooks))
+        hooks = self._hooks(settings, observer)
+        for name, address in zip(context.robot.link_names, settings.addresses, strict=True):
+            links.add(Connection(name, f"{keys.robot} {name}", address, settings, hooks))
 
-    def _hooks(self, name: str, address: DeviceAddress, connect: Connect, sessions: SessionTable) -> Hooks:
+    def _hooks(self, settings: LinkSettings, observer: Observer | None) -> LinkHooks:
         context, presence = self._context, self._presence
-        return Hooks(
-            session=partial(self._session, name, str(address)),
+        conversation = ConversationHooks(
             deliver=self._telemetry.deliver,
-            session_changed=presence.session_changed,
-            state_changed=self._state_changed,
-            connect=connect,
-            manager=sessions,
+            before=self.enforcer.keep_time,
+            clock=context.clock,
+            share=settings.share,
             malformed=context.metrics.count("malformed"),
             foreign=context.metrics.count("foreign_datagrams"),
-            clock=context.clock,
-            before=self._enforcer.keep_time,
-            share=self._share,
-            shared=self._shared_address,
             surplus=context.metrics.count("datagrams_over_share"),
-            stalled=partial(presence.stalled, name),
-            linked=partial(self._observer.linked, name),
-            read=partial(self._observer.read, name, partial(self.partial, name)),
+        )
+        return LinkHooks(
+            self._session,
+            presence.session_changed,
+            presence.state_changed,
+            presence.stalled,
+            self._observer.linked,
+            observer.read if observer is not None else None,
+            conversation,
         )
 
     def __repr__(self) -> str:
-        return f"<RobotDevice {self._context.keys.robot} {self._links.first.state}>"
+        return f"<RobotDevice {self._context.keys.robot} {self.observed.state}>"
 
     async def run(self, begin: Callable[[], Awaitable[None]] | None = None) -> None:
         """Serve the robot until cancelled; then stop it if it moves, and take leave of it.
@@ -180,17 +145,20 @@ class RobotDevice(Transferable):
         """
         if begin is None:
             self._show()
-        self._declare()
+        bus = self._context.bus
+        bus.on_relief(self._links.resume_reading)
+        self._listen()
+        self._declared = [bus.watch_connected(self._on_bus)]
         if begin is not None:
-            await self._context.bus.alive(self._context.keys.alive("gateway"))  # by its answer the bus knows our keys
+            await bus.alive(self._context.keys.alive("gateway"))  # by its answer the bus knows our keys
             await begin()
             await self.resume()
             if self._crashed:
                 self._publishers.repeat()
             self._show()
-        if not self._aside:
+        if not self.observed.aside:
             self._standstill.begin()
-        self._observer.began(self)
+        self._observer.began(self.observed)
         async with asyncio.TaskGroup() as tasks:
             work = [tasks.create_task(self._beat()), tasks.create_task(self._latch_news.run())]
             work += [tasks.create_task(connection.run()) for connection in self._links]
@@ -204,69 +172,19 @@ class RobotDevice(Transferable):
 
     def _show(self) -> None:
         self._presence.publish_status()
-        self._enforcer.report()
-
-    def _declare(self) -> None:
-        bus = self._context.bus
-        bus.on_relief(self._links.resume_reading)
-        self._listen()
-        self._declared = [bus.watch_connected(self._on_bus)]
+        self.enforcer.report()
 
     def _listen(self) -> None:
         """Take commands and queries from the bus, and watch for listeners; idempotent. Not while another one serves."""
-        if self._aside:
+        if self.observed.aside:
             return
         context = self._context
         self._on_demand = self._on_demand or self._telemetry.serve()
         self._commanded = self._commanded or [
             *self._leases.serve(),
-            context.bus.subscribe(context.keys.key("@cmd/**"), self._commands.take, priority=self._enforcer.admission),
+            context.bus.subscribe(context.keys.key("@cmd/**"), self._commands.take, priority=self.enforcer.admission),
             *self._queries.serve(),
         ]
-
-    @property
-    def driven(self) -> bool:
-        """Whether a program drives the robot, or told it to move by itself."""
-        return self._enforcer.authority.driven or self._enforcer.authority.moving
-
-    @property
-    def state(self) -> str:
-        """The state of the robot, as on ``status``."""
-        return self._links.first.state
-
-    def last_stop(self) -> LastStop:
-        """Return what stops the robot now; see :class:`LastStop`."""
-        session, driven, state = self._context.robot.driving, self.driven, self.state
-        if self._aside or session is None or session.state is not State.ESTABLISHED:
-            return LastStop(driven, state=state)
-        try:
-            frames = self._context.robot.stop_frames()
-        except Refused:
-            frames = ()
-        except Exception as error:
-            self._context.faults.note("stop", error)
-            frames = ()
-        stop = tuple(StopFrame(bytes(frame), type(frame) is Datagram) for frame in frames)
-        return LastStop(driven, stop, session.outbox.gap_s, state)
-
-    def boundary(self, name: str) -> Boundary:
-        """Return where the outgoing stream of a link stands; see :class:`Boundary`."""
-        conversation = self._links.conversation(name)
-        return Boundary(conversation is not None and not conversation.stalled)
-
-    def partial(self, name: str, most_bytes: int) -> Partial | None:
-        """Return the incomplete frame that came by a link; see :meth:`Session.partial`."""
-        conversation = self._links.conversation(name)
-        return conversation.session.partial(most_bytes) if conversation is not None else None
-
-    def _state_changed(self) -> None:
-        self._presence.publish_status()
-        self._observer.changed()
-
-    def refuse(self, command: str, refusal: Refused, who: str) -> None:
-        """Show on ``control`` what was refused to somebody."""
-        self._enforcer.refuse(command, refusal, who)
-        self._enforcer.settle()
 
     def _session(self, link: str, address: str) -> Session[Any]:
         """Make the session of a new connection; the names of the one before it are given up."""
@@ -274,9 +192,14 @@ class RobotDevice(Transferable):
             self._publishers.forget_names()
         return self._context.robot.session(link, address)
 
+    def _refuse_all(self, reason: str | None) -> None:
+        """Take no command and give no lease from now on; None: again."""
+        self._commands.refuse_all(reason)
+        self._leases.refuse_all(reason)
+
     def _on_bus(self, connected: bool) -> None:
         if not connected:
-            self._enforcer.bus_lost()
+            self.enforcer.bus_lost()
         else:
             self._latch_news.returned()
 
@@ -286,7 +209,7 @@ class RobotDevice(Transferable):
             self._publishers.expire()
             if self._commanded:  # else another gateway, or the next process, says it
                 self._presence.publish_status()
-                self._enforcer.beat()
+                self.enforcer.beat()
 
     # Another gateway serves the robot too
 
@@ -294,35 +217,32 @@ class RobotDevice(Transferable):
     def standing(self) -> Standing:
         """How this gateway stands with the robot."""
         session, talk = self._context.robot.driving, self._links.first.conversation
-        record = self._enforcer.authority.latches.record
+        record = self.enforcer.authority.latches.record
         if talk is None or session is None:
             return Standing(record=record)
         established = session.state is State.ESTABLISHED and session.doubtful is None
-        healthy = established and not talk.stalled and talk.unheard_s <= HEARD_S
-        return Standing(healthy, talk.connected_s, record)
+        now = self._context.clock()
+        healthy = established and not talk.stalled and now - talk.heard_at <= HEARD_S
+        connected_s = now - talk.connected_at if talk.link is not None and talk.connected_at is not None else 0.0
+        return Standing(healthy, connected_s, record)
 
     @property
     def must_stay(self) -> bool:
         """Whether there is a connection that must not be closed while another gateway has one."""
         return not self._context.robot.closing_harmless and any(connection.is_up for connection in self._links)
 
-    def merge(self, record: LatchRecord) -> None:
-        """Take over what another gateway of this robot knows: latched stops, and whether the robot moves by itself."""
-        self._enforcer.merge(record)
-
     async def step_aside(self) -> None:
         """Stop the robot once, and leave it to another gateway: only what keeps the connections alive is written.
 
         Nothing is published, and no command or query taken, until :meth:`step_in`.
         """
-        if self._aside:  # as the process before this one
+        if self.observed.aside:  # as the process before this one
             return
-        self._commands.refuse_all(_ASIDE)
-        self._leases.refuse_all(_ASIDE)
-        self._enforcer.stop(_ASIDE)
-        self._enforcer.beat()
+        self._refuse_all(_ASIDE)
+        self.enforcer.stop(_ASIDE)
+        self.enforcer.beat()
         self._pending.refuse_all(_ASIDE)
-        self._aside = True
+        self.observed.aside = True
         self._standstill.close()
         await self.withdraw()
         self._publishers.mute(True)
@@ -336,16 +256,15 @@ class RobotDevice(Transferable):
 
     async def step_in(self) -> None:
         """Serve the robot again, beginning with a stop."""
-        self._aside = False
+        self.observed.aside = False
         for connection in self._links:
             connection.mute(False)
         self._publishers.mute(False)
         self._listen()
-        self._commands.refuse_all(None)
-        self._leases.refuse_all(None)
+        self._refuse_all(None)
         self._latch_news.returned()
         self._standstill.begin()
-        self._enforcer.stop("served again")
+        self.enforcer.stop("served again")
         self._show()
         self._observer.changed()
 
@@ -365,9 +284,8 @@ class RobotDevice(Transferable):
         """
         if not self._context.robot.hands_over:
             raise Unsupported(f"protocol {self._protocol} does not hand its sessions over")
-        self._commands.refuse_all(reason)
-        self._leases.refuse_all(reason)
-        self._enforcer.stop(reason)
+        self._refuse_all(reason)
+        self.enforcer.stop(reason)
         self._context.pump()
         until = self._context.clock() + within_s
         while any(connection.blocker for connection in self._links):
@@ -386,8 +304,8 @@ class RobotDevice(Transferable):
             "links": [connection.export(parcel, budget) for connection in self._links],
             "robot": self._context.robot.export(budget),
             "published": self._publishers.export(budget),
-            "latches": self._enforcer.authority.latches.export(),
-            "aside": self._aside,
+            "latches": self.enforcer.authority.latches.export(),
+            "aside": self.observed.aside,
         }
 
     def deposit(self, parcel: Parcel, budget: Budget) -> Exported | None:
@@ -408,13 +326,12 @@ class RobotDevice(Transferable):
 
         Call :meth:`run` with ``begin`` then. partials: with a deposit, the incomplete frames of the links that are up.
         """
-        self._commands.refuse_all(_TAKING_OVER)
-        self._leases.refuse_all(_TAKING_OVER)
+        self._refuse_all(_TAKING_OVER)
         self._crashed = bool(state.get(_CRASHED))
-        self._aside = self._publishers.muted = state["aside"]
+        self.observed.aside = self._publishers.muted = state["aside"]
         for connection in self._links:
-            connection.mute(self._aside)
-        self._enforcer.authority.restore_latches(state["latches"])
+            connection.mute(self.observed.aside)
+        self.enforcer.authority.restore_latches(state["latches"])
         for link, partial_frame in zip(filter(None, state["links"]), partials, strict=False):
             link["session"][PARTIAL] = list(partial_frame)
         for connection, link in zip(self._links, state["links"], strict=True):
@@ -432,16 +349,11 @@ class RobotDevice(Transferable):
                 with contextlib.suppress(Refused):
                     self._standstill.stop()
 
-    def restore_latches(self, latches: Latches) -> None:
-        """Take over latched stops that were written down, before the robot is served."""
-        self._enforcer.restore(latches)
-
     async def resume(self) -> None:
         """Read, write and take commands: again, or for the first time with what was taken over."""
         self._listen()
-        reason = _ASIDE if self._aside else None
-        self._commands.refuse_all(reason)
-        self._leases.refuse_all(reason)
+        reason = _ASIDE if self.observed.aside else None
+        self._refuse_all(reason)
         for connection in self._links:
             await connection.resume()
 
@@ -455,7 +367,7 @@ class RobotDevice(Transferable):
         """Give the links up and end :meth:`run`; the robot notices nothing."""
         self._detached.set()
         self._standstill.close()
-        self._enforcer.close()
+        self.enforcer.close()
         self._context.conditions.changed = lambda: None
         for connection in self._links:
             connection.detach()
@@ -463,15 +375,14 @@ class RobotDevice(Transferable):
     async def _shut_down(self) -> None:
         """Stop a moving robot, take leave of it, say so on the bus, and leave the robot's keys to others."""
         self._presence.leave()
-        self._commands.refuse_all(_LEAVING)
-        self._leases.refuse_all(_LEAVING)
-        if self._enforcer.authority.moving:
-            self._enforcer.stop(_LEAVING)
+        self._refuse_all(_LEAVING)
+        if self.enforcer.authority.moving:
+            self.enforcer.stop(_LEAVING)
         await asyncio.sleep(min(self._standstill.stopping_s, STOP_REPEAT_S))
         await asyncio.gather(*(connection.close(_LEAVING, LEAVE_S) for connection in self._links))
         self._presence.publish_status()
         self._standstill.close()
-        self._enforcer.close()
+        self.enforcer.close()
         self._observer.ended()
         with contextlib.suppress(BusError, TimeoutError):
             async with asyncio.timeout(FLUSH_S):

@@ -5,16 +5,17 @@ An observer is told of every change; it asks the device for the rest. Knows no p
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Protocol
+from collections.abc import Iterable
 
 import msgspec
 
+from zbridge.control.authority import Authority
+from zbridge.control.context import RobotContext
+from zbridge.errors import Refused
+from zbridge.protocol.session import Datagram, State
+from zbridge.robot.connection import Links, Resume
 from zbridge.transport import Link
 from zbridge.wire.frames import Partial
-
-Resume = Callable[[int], Partial | None]
-"""``resume(most_bytes)``: the incomplete frame of a stream, by :meth:`zbridge.wire.frames.FrameBuffer.partial`."""
 
 
 class StopFrame(msgspec.Struct, frozen=True, array_like=True):
@@ -43,31 +44,59 @@ class Boundary(msgspec.Struct, frozen=True):
     outgoing: bool = True
 
 
-class Observed(Protocol):
-    """A device, as an observer sees it."""
+class ObservedRobot:
+    """One robot as an observer sees it. aside: whether another gateway serves it while this one's link is kept."""
+
+    def __init__(self, context: RobotContext, links: Links, authority: Authority) -> None:
+        self.aside = False
+        self._context = context
+        self._links = links
+        self._authority = authority
+
+    def __repr__(self) -> str:
+        return f"<ObservedRobot {self._context.keys.robot} {self.state}>"
 
     @property
     def driven(self) -> bool:
         """Whether a program drives the robot, or told it to move by itself."""
+        return self._authority.driven or self._authority.moving
 
     @property
     def state(self) -> str:
         """The state of the robot, as on ``status``."""
+        return self._links.first.state
 
     def last_stop(self) -> LastStop:
-        """Return what stops the robot now."""
+        """Give what stops the robot now; see :class:`LastStop`."""
+        context, driven, state = self._context, self.driven, self.state
+        session = context.robot.driving
+        if self.aside or session is None or session.state is not State.ESTABLISHED:
+            return LastStop(driven, state=state)
+        frames: Iterable[bytes] = ()
+        try:
+            frames = context.robot.stop_frames()
+        except Refused:
+            pass
+        except Exception as error:
+            context.faults.note("stop", error)
+        stop = tuple(StopFrame(bytes(frame), type(frame) is Datagram) for frame in frames)
+        return LastStop(driven, stop, session.outbox.gap_s, state)
 
     def boundary(self, name: str) -> Boundary:
-        """Return where the outgoing stream of the link of this name stands."""
+        """Give where the outgoing stream of the link of this name stands; see :class:`Boundary`."""
+        conversation = self._links.conversation(name)
+        return Boundary(conversation is not None and not conversation.stalled)
 
     def partial(self, name: str, most_bytes: int) -> Partial | None:
-        """Return the incomplete frame that came by the link of this name; see :data:`Resume`."""
+        """Give the incomplete frame that came by the link of this name; see :data:`Resume`."""
+        conversation = self._links.conversation(name)
+        return conversation.session.partial(most_bytes) if conversation is not None else None
 
 
-class Observer(Protocol):
-    """Is told what happens to the links of one robot. All methods run on the event loop and return at once."""
+class Observer:
+    """Is told what happens to the links of one robot; override what concerns you, and return at once."""
 
-    def began(self, device: Observed) -> None:
+    def began(self, device: ObservedRobot) -> None:
         """Start: the device serves its robot."""
 
     def ended(self) -> None:
@@ -80,32 +109,10 @@ class Observer(Protocol):
         """Note that the bytes of a read of this link have been cut into frames."""
 
     def changed(self, *, at_once: bool = False) -> None:
-        """Note that :meth:`Observed.last_stop` may give something else from now on. Called for every command.
+        """Note that :meth:`ObservedRobot.last_stop` may give something else from now on. Called for every command.
 
         at_once: after a command on which the way to stop the robot may depend, as its mode.
         """
 
     def published(self) -> None:
         """Note that a key that keeps its last value was published for the first time."""
-
-
-class Nobody:
-    """The observer of a robot that nobody else looks after."""
-
-    def began(self, device: Observed) -> None:
-        """Do nothing."""
-
-    def ended(self) -> None:
-        """Do nothing."""
-
-    def linked(self, name: str, link: Link, up: bool) -> None:
-        """Do nothing."""
-
-    def read(self, name: str, resume: Resume) -> None:
-        """Do nothing."""
-
-    def changed(self, *, at_once: bool = False) -> None:
-        """Do nothing."""
-
-    def published(self) -> None:
-        """Do nothing."""

@@ -16,6 +16,7 @@ from zbridge.fleet.messages import LINK_BLOCKED, Status
 from zbridge.protocol.session import Session, State
 from zbridge.robot.commands import Commands
 from zbridge.robot.connection import Links
+from zbridge.robot.observer import Observer
 from zbridge.robot.queries import PendingQueries
 
 log = logging.getLogger("zbridge.robot.device")
@@ -33,6 +34,7 @@ class Presence:
         standstill: Standstill,
         commands: Commands,
         pending: PendingQueries,
+        observer: Observer,
     ) -> None:
         self._context = context
         self._protocol = protocol
@@ -41,6 +43,7 @@ class Presence:
         self._standstill = standstill
         self._commands = commands
         self._pending = pending
+        self._observer = observer
         self._greeted: Session[Any] | None = None
         self._busy: str | None = None
         self._doubtful: str | None = None
@@ -89,6 +92,11 @@ class Presence:
             log.warning("%s: %s", self._context.keys.robot, LINK_BLOCKED)
         else:
             self._enforcer.require_neutral("the robot's link stalled", stops=True)
+
+    def state_changed(self) -> None:
+        """Show the new state of a link."""
+        self.publish_status()
+        self._observer.changed()
 
     def publish_status(self) -> None:
         """Publish ``status`` as it is now."""

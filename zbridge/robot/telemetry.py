@@ -114,7 +114,7 @@ class Telemetry:
             def show(frame: bytes) -> None:
                 publisher.put(frame, topics.WIRE_DATAGRAM if type(frame) is Datagram else None)
 
-            connection.watch(direction, show if anybody else None)
+            connection.wire.watch(direction, show if anybody else None)
 
         return listened
 

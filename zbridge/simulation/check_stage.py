@@ -21,7 +21,7 @@ from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.protocol.plugin import Protocol, RobotSide, Simulation
 from zbridge.protocol.session import Session, State
-from zbridge.transport import Conversation, connect
+from zbridge.transport import Conversation, ConversationHooks, connect
 
 
 class CheckFinding(msgspec.Struct, frozen=True):
@@ -123,7 +123,7 @@ class Stage:
             if not self.sessions:
                 session.tap = lambda direction, frame: self.frames.append((direction, frame))
             self.sessions.append(session)
-            self._conversations.append(Conversation(session, loop, deliver=self._deliver))
+            self._conversations.append(Conversation(session, loop, ConversationHooks(deliver=self._deliver)))
             await connect(self._protocol.device_address(str(address)), self._conversations[-1])
 
     def _deliver(self, messages: list[Any]) -> None:

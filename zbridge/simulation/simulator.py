@@ -18,7 +18,7 @@ from zbridge.errors import EncodeError, Refused
 from zbridge.protocol.plugin import Simulation
 from zbridge.protocol.session import Session, State
 from zbridge.simulation.timing import Ticker
-from zbridge.transport import Accepted, Conversation, Link, listen
+from zbridge.transport import Accepted, ClientConversation, Conversation, ConversationHooks, Link, listen
 
 STEP_S = 0.02
 """Seconds between two steps of a simulated robot, in its own time too."""
@@ -117,9 +117,8 @@ class Simulator(ABC, Generic[M]):
         session = self.session(link.peer, name)
         if session is None:
             return None
-        client: Conversation = Conversation(
-            session, self._loop, deliver=lambda messages: self._deliver(client, messages)
-        )
+        hooks = ConversationHooks(deliver=lambda messages: self._deliver(client, messages))
+        client = ClientConversation(session, self._loop, hooks)
         client.ended.add_done_callback(lambda _: self._dismiss(client))
         self._log.info("%s: connected as %s", link.peer, session.name)
         self._loop.call_soon(self._greet, client, name)  # the session is opened first
@@ -135,5 +134,6 @@ class Simulator(ABC, Generic[M]):
             self.take(client, message)
 
     def _dismiss(self, client: Conversation) -> None:
+        self._log.info("%s: %s", client.session.peer, client.session.reason)
         self._clients.pop(client, None)
         self.dismiss(client)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from zbridge.transport.accepted import Accepted
+from zbridge.transport.accepted import Accepted, ClientConversation
 from zbridge.transport.by_address import attach, connect
-from zbridge.transport.conversation import Conversation
+from zbridge.transport.conversation import Conversation, ConversationHooks
 from zbridge.transport.door import Door
 from zbridge.transport.link import Link, Receiver
 from zbridge.transport.tcp import TcpLink, listen
@@ -13,7 +13,9 @@ from zbridge.transport.transferable import Parcel, Transferable
 
 __all__ = [
     "Accepted",
+    "ClientConversation",
     "Conversation",
+    "ConversationHooks",
     "Door",
     "Link",
     "Parcel",

@@ -5,70 +5,59 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 
-from zbridge.transport.conversation import Conversation
+from zbridge.errors import Refused
+from zbridge.protocol.traffic import SourceClaims
+from zbridge.transport.conversation import Conversation, then_pump
 from zbridge.transport.link import Link, Receiver
 
 log = logging.getLogger("zbridge.link")
 
 
 class Accepted(Receiver):
-    """The receiver of an accepted link; ``admit`` makes its conversation, or refuses the peer with None.
+    """The receiver of an accepted link until ``admit`` has made its own, or refused the peer with None."""
 
-    ``level``: log level of the line about the end of the link.
-    """
-
-    def __init__(self, admit: Callable[[Link], Conversation | None], level: int = logging.INFO) -> None:
+    def __init__(self, admit: Callable[[Link], Receiver | None]) -> None:
         self._admit = admit
-        self._level = level
-        self._conversation: Conversation | None = None
-
-    def __repr__(self) -> str:
-        return f"<Accepted {self._conversation!r}>"
 
     def attached(self, link: Link) -> None:
-        """Begin the conversation, or close the link."""
-        self._conversation = self._admit(link)
-        if self._conversation is None:
+        """Leave the link to the receiver that is made, or close it."""
+        receiver = self._admit(link)
+        if receiver is None:
             link.close()
         else:
-            self._conversation.attached(link)
+            link.receiver = receiver
+            receiver.attached(link)
 
-    def received(self, data: bytes) -> None:
-        """Take bytes from the link."""
-        if self._conversation is not None:
-            self._conversation.received(data)
 
-    def lost(self, reason: str) -> None:
-        """End: the link is gone."""
-        if self._conversation is not None:
-            log.log(self._level, "%s: %s", self._conversation.session.peer, reason)
-            self._conversation.lost(reason)
-
-    def received_datagram(self, datagram: bytes) -> None:
-        """Take a datagram from the link."""
-        if self._conversation is not None:
-            self._conversation.received_datagram(datagram)
+class ClientConversation(Conversation):
+    """A conversation with an accepted peer, whose session may have to say which datagrams come from that peer."""
 
     def claims(self, datagram: bytes, port: int) -> bool:
-        """Ask the session whether this datagram is from its peer."""
-        return self._conversation is not None and self._conversation.claims(datagram, port)
+        session = self.session
+        return isinstance(session, SourceClaims) and session.claims(datagram, port)
 
+    @then_pump
     def rivalled(self) -> None:
-        """Notify the conversation of a second source, or conversation, with the same claim."""
-        if self._conversation is not None:
-            self._conversation.rivalled()
+        """Count a second source, or session, with the same claim, and tell the session."""
+        session = self.session
+        self._hooks.rivals.value += 1
+        if isinstance(session, SourceClaims):
+            session.rivalled(self._clock())
+        if self._hooks.may_warn("with a rival source of datagrams"):
+            log.warning("%s: another source of datagrams claims to be %s", self.session.name, self.session.peer)
 
     def stray_datagram(self, datagram: bytes) -> None:
-        """Show the session a datagram of the peer's host that nobody claimed."""
-        if self._conversation is not None:
-            self._conversation.stray_datagram(datagram)
+        session = self.session
+        try:
+            if isinstance(session, SourceClaims):
+                session.stray(datagram)
+        except Refused as refusal:
+            self._hooks.refused(refusal)
 
-    def foreign_datagram(self) -> None:
-        """Count a datagram that came from elsewhere."""
-        if self._conversation is not None:
-            self._conversation.foreign_datagram()
-
-    def writable(self) -> None:
-        """Resume writing."""
-        if self._conversation is not None:
-            self._conversation.writable()
+    def pump(self) -> None:
+        """Write what may be written, without a source of datagrams that the session has dropped."""
+        session = self.session
+        if isinstance(session, SourceClaims) and session.drops_source and self.link is not None:
+            session.drops_source = False
+            self.link.drop_source()
+        super().pump()

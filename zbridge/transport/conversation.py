@@ -4,9 +4,13 @@ A process that was frozen finds its timers overdue and the peer's bytes unread. 
 (``before``), waiting input, and the session's timers :data:`CATCH_UP_S` later. So no session ends for a silence that
 the process itself caused.
 
-Only ``pump`` writes. Everything that may give the session something to write, or change its state, ends with it: bytes,
-a timer, a command of the device. An exception of the protocol's own code in any of them ends its session, with file and
-line as the reason.
+``pump`` is the one place that writes. Everything that may give the session something to write, or change its state,
+ends with it: bytes, a timer, a command of the device. What the protocol's own code raises in any of them ends its
+session, with the place as the reason.
+
+A link is stalled when bytes have waited for their acknowledgement for longer than STALLED_S. From then on nothing is
+written: a robot would read what piles up as one packet, and lose it. The stall ends, before the next write, when all is
+acknowledged.
 """
 
 from __future__ import annotations
@@ -16,16 +20,16 @@ import logging
 import math
 from collections.abc import Callable
 from functools import wraps
-from typing import Any, Concatenate, ParamSpec
+from typing import Any, Concatenate, ParamSpec, TypeVar
+
+import msgspec
 
 from zbridge.errors import FAULT, Refused, describe
 from zbridge.metrics import Count
 from zbridge.protocol.kept import Budget, Exported
 from zbridge.protocol.session import Datagram, Session, State
-from zbridge.transport.fair_share import FairShare
-from zbridge.transport.link import Link
-from zbridge.transport.reading import ReadControl
-from zbridge.transport.stalls import Stalls
+from zbridge.transport.link import STALLED_S, Link, Receiver
+from zbridge.transport.reading import FairShare, ReadControl
 from zbridge.transport.transferable import Parcel
 
 log = logging.getLogger("zbridge.link")
@@ -33,163 +37,143 @@ log = logging.getLogger("zbridge.link")
 LATE_S = 0.02
 """A session's timer that fires this late shows that the process, or the machine, was held up; seconds."""
 CATCH_UP_S = 0.05
-"""Seconds for which such a process reads before it runs the session's timers."""
-_ESTABLISHED = State.ESTABLISHED
+"""Seconds for which such a process reads before the timers of the session run."""
+LOOK_S = 0.05
+"""Seconds between two checks of a stalled link."""
+_ESTABLISHED, _CLOSED = State.ESTABLISHED, State.CLOSED
 
-
+_C = TypeVar("_C", bound="Conversation")
 _P = ParamSpec("_P")
 
 
-def _then_pump(step: Callable[Concatenate[Conversation, _P], None]) -> Callable[Concatenate[Conversation, _P], None]:
-    """Make a step end with ``pump``; an exception of the protocol's own code ends the session."""
+class ConversationHooks(msgspec.Struct, frozen=True, kw_only=True):
+    """What a conversation calls, counts and uses of whoever holds it."""
+
+    deliver: Callable[[list[Any]], None] = lambda messages: None
+    """Takes the messages of each read."""
+    changed: Callable[[], object] = lambda: None
+    """Called on every change of the session's state."""
+    before: Callable[[], object] = lambda: None
+    """Called before each read and write: what must leave first may be given to the session there."""
+    read: Callable[[], object] | None = None
+    """Called when the bytes of a read have been cut into frames."""
+    stalled: Callable[[bool], object] = lambda stalled: None
+    """Called when the link is stalled (True), and when that ends (False)."""
+    linked: Callable[[Link, bool], object] = lambda link, up: None
+    """Called when the link is up (True), and when it is gone (False)."""
+    refused: Callable[[Refused], object] = lambda refusal: None
+    """Told which datagrams in the peer's name did not come from the peer."""
+    may_warn: Callable[[str], bool] = lambda kind: True
+    """Says whether a warning of this kind may be logged now."""
+    clock: Callable[[], float] | None = None
+    """Seconds on the loop's time line; by default the loop's own clock, which may be a millisecond behind."""
+    share: FairShare | None = None
+    """Of a processor; who sends more than can be worked off within it is not read meanwhile."""
+    malformed: Count = msgspec.field(default_factory=Count)
+    foreign: Count = msgspec.field(default_factory=Count)
+    rivals: Count = msgspec.field(default_factory=Count)
+    surplus: Count = msgspec.field(default_factory=Count)
+    """Counts datagrams that were dropped because the share was used up."""
+
+
+def then_pump(step: Callable[Concatenate[_C, _P], None]) -> Callable[Concatenate[_C, _P], None]:
+    """Let a step end with ``pump``; a fault of the protocol's own code ends the session."""
 
     @wraps(step)
-    def contained(self: Conversation, /, *args: _P.args, **kwargs: _P.kwargs) -> None:
+    def contained(self: _C, /, *args: _P.args, **kwargs: _P.kwargs) -> None:
         try:
             step(self, *args, **kwargs)
-            self._pump()
         except Exception as error:
             self._fault(error)
+        else:
+            self.pump()
 
     return contained
 
 
-class Conversation:
-    """The receiver of a link, and the driver of a session.
+class Conversation(Receiver):
+    """The receiver of a link, and the driver of a session."""
 
-    ``deliver`` receives the messages of each read. ``changed`` is called on every change of the session's state.
-    ``before`` is called before each write, and may pass the session what must leave first.
-    ``stalled(True)`` is called when bytes have waited for their acknowledgement for longer than STALLED_S. From then on
-    nothing is written: a robot would read what piles up as one packet, and lose it. ``stalled(False)`` is called when
-    all is acknowledged, before the next write.
-    ``refused`` is called for datagrams in the peer's name that did not come from the peer.
-    ``may_warn(kind)`` returns whether a warning of this kind may be logged now.
-    ``share``: of a processor; a peer that sends more than can be processed within it is not read meanwhile, and its
-    datagrams are dropped and counted by ``surplus``.
-    ``linked`` is called with the link and True when the link is up, and False when it is gone.
-    ``read`` is called when the bytes of a read have been cut into frames.
-    ``clock``: seconds on the loop's time line; the default is the loop's own clock, which may be a millisecond behind.
-    """
-
-    def __init__(
-        self,
-        session: Session[Any],
-        loop: asyncio.AbstractEventLoop,
-        *,
-        deliver: Callable[[list[Any]], None],
-        changed: Callable[[], None] = lambda: None,
-        malformed: Count | None = None,
-        foreign: Count | None = None,
-        rivals: Count | None = None,
-        refused: Callable[[Refused], None] = lambda refusal: None,
-        may_warn: Callable[[str], bool] = lambda kind: True,
-        clock: Callable[[], float] | None = None,
-        before: Callable[[], object] = lambda: None,
-        stalled: Callable[[bool], object] = lambda stalled: None,
-        share: FairShare | None = None,
-        surplus: Count | None = None,
-        linked: Callable[[Link, bool], object] = lambda link, up: None,
-        read: Callable[[], object] = lambda: None,
-    ) -> None:
-        self._read = read
+    def __init__(self, session: Session[Any], loop: asyncio.AbstractEventLoop, hooks: ConversationHooks) -> None:
         self.session = session
-        self._linked = linked
-        self._observed: Link | None = None
-        self._before = before
         self.ended: asyncio.Future[None] = loop.create_future()
+        self.link: Link | None = None
+        """The connection; None before there is one, and after it."""
+        self.connected_at: float | None = None
+        """When the link came up, also of the process that had it before; None before it was ever up."""
         self._loop = loop
-        self._clock = clock or loop.time
-        self._deliver = deliver
-        self._changed = changed
-        self._link: Link | None = None
+        self._hooks = hooks
+        self._clock = clock = hooks.clock or loop.time
+        self._before, self._read = hooks.before, hooks.read
+        self._observed: Link | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at: float | None = None
         self._reads_until = -math.inf
         """When the session's timers run again: the process was held up, and reads first."""
         self._seen = (session.state, session.busy, session.doubts)
-        self._malformed = malformed or Count()
-        self._foreign = foreign or Count()
-        self._rivals = rivals or Count()
-        self._refused = refused
-        self._may_warn = may_warn
         self._malformed_logged = 0
-        self._surplus = surplus or Count()
-        self._stalls = Stalls(self._clock, stalled)
-        self._reading = ReadControl(loop, self._clock, share)
-        self.connected_at: float | None = None
-        """When the link came up, also in the process that had it before; None if it was never up."""
-        self._heard_at = -math.inf
+        self._blocked = False
+        """Whether nothing is written because the link is stalled."""
+        self.reading = ReadControl(loop, clock, hooks.share)
+        self.heard_at = -math.inf
+        """When anything came by the link last, or it came up."""
 
     def __repr__(self) -> str:
         return f"<Conversation {self.session!r}>"
 
-    @_then_pump
+    @then_pump
     def attached(self, link: Link) -> None:
-        """Begin: the link is up."""
-        self._link = self._observed = self._reading.link = link
-        self._heard_at = self._clock()
+        self.link = self._observed = self.reading.link = link
+        self.heard_at = self._clock()
         if self.connected_at is None:
-            self.connected_at = self._heard_at
-        self._linked(link, True)
-        if self._reading.suspended:
+            self.connected_at = self.heard_at
+        self._hooks.linked(link, True)
+        if self.reading.suspended:
             link.suspend()
         self.session.peer = link.peer
         self.session.open(self._clock())
 
     def received(self, data: bytes) -> None:
-        """Take bytes from the link."""
-        begun = self._heard_at = self._clock()
+        begun = self.heard_at = self._clock()
         try:
             self._before()
             messages = self.session.receive(data, begun)
-            self._read()
+            if self._read is not None:
+                self._read()
             self._hand_on(messages)
-            self._pump()
         except Exception as error:
             self._fault(error)
-        self._reading.worked(begun)
+        else:
+            self.pump()
+        if self._hooks.share is not None:
+            self.reading.worked(begun)
 
-    @_then_pump
+    @then_pump
     def received_datagram(self, datagram: bytes) -> None:
-        """Take a datagram from the link."""
-        begun = self._heard_at = self._clock()
-        if self._reading.rests:
-            self._surplus.value += 1
+        begun = self.heard_at = self._clock()
+        if self.reading.rests:
+            self._hooks.surplus.value += 1
             return
         self._hand_on(self.session.receive_datagram(datagram, begun))
-        self._reading.worked(begun)
-
-    def claims(self, datagram: bytes, port: int) -> bool:
-        """Ask the session whether this datagram is from its peer."""
-        return self.session.claims(datagram, port)
-
-    @_then_pump
-    def rivalled(self) -> None:
-        """Count a second source, or session, with the same claim, and notify the session."""
-        self._rivals.value += 1
-        self.session.rivalled(self._clock())
-        if self._may_warn("with a rival source of datagrams"):
-            log.warning("%s: another source of datagrams claims to be %s", self.session.name, self.session.peer)
-
-    def stray_datagram(self, datagram: bytes) -> None:
-        """Show the session a datagram of the peer's host that nobody claimed."""
-        try:
-            self.session.stray(datagram)
-        except Refused as refusal:
-            self._refused(refusal)
+        self.reading.worked(begun)
 
     def foreign_datagram(self) -> None:
-        """Count a datagram that came from elsewhere."""
         self.session.traffic.foreign += 1
-        self._foreign.value += 1
+        self._hooks.foreign.value += 1
 
     def _hand_on(self, messages: list[Any]) -> None:
         if self.session.state is not self._seen[0] and not self.session.over:
             self._notify()
         if messages:  # the messages before the end of a session are delivered before the end is reported
-            self._deliver(messages)
-        if self.session.traffic.malformed != self._malformed_logged:
-            self._report_malformed()
+            self._hooks.deliver(messages)
+        count, logged = self.session.traffic.malformed, self._malformed_logged
+        if count == logged:
+            return
+        self._hooks.malformed.value += count - logged
+        # a warning at malformed messages 1, 2, 4, 8 ...: the log stays readable in a flood
+        if count.bit_length() != logged.bit_length() and self._hooks.may_warn("warnings of malformed messages"):
+            log.warning("%s: %d malformed so far, last: %s", self.session.name, count, self.session.last_malformed)
+        self._malformed_logged = count
 
     def _fault(self, error: Exception) -> None:
         """End the session, and log where the code of its protocol is wrong."""
@@ -198,42 +182,64 @@ class Conversation:
         self._end()
         self._notify()
 
-    @_then_pump
+    @then_pump
     def lost(self, reason: str) -> None:
-        """End: the link is gone."""
         if self._observed is not None:
-            self._linked(self._observed, False)
-        self._link = self._observed = self._reading.link = None
+            log.debug("%s: %s", self.session.peer, reason)
+            self._hooks.linked(self._observed, False)
+        self.link = self._observed = self.reading.link = None
         self.session.lost(reason)
+
+    def writable(self) -> None:
+        self.pump()
 
     def pump(self) -> None:
         """Write what may be written now, report a change of state, and set the timer for the rest."""
+        if self.reading.suspended:
+            return
+        session = self.session
         try:
-            self._pump()
+            writes_at, waited_s = self._write()
+            changed = (session.state, session.busy, session.doubts) != self._seen
+            if changed:
+                self._notify()
+            if session.state is _CLOSED:
+                self._end()
+                return
+            if changed:  # who was notified may have given the session something to write
+                writes_at, waited_s = self._write()
+            now = self._clock()
+            at = self._reads_until if now < self._reads_until else session.deadline(writing=False)
+            if writes_at is not None and (at is None or writes_at < at):
+                at = writes_at
+            if waited_s or self._blocked:
+                look_at = now + (LOOK_S if self._blocked else max(0.0, STALLED_S - waited_s) + LOOK_S / 10)
+                at = look_at if at is None else min(at, look_at)
+            self._set_timer(at)
         except Exception as error:
             self._fault(error)
 
-    def writable(self) -> None:
-        """Resume writing."""
-        self.pump()
-
-    def _pump(self) -> None:
-        if self._reading.suspended:
-            return
-        session, link = self.session, self._link
-        outbox = session.outbox
-        if session.drops_source and link is not None:
-            session.drops_source = False
-            link.drop_source()
-        established = session.state is _ESTABLISHED
-        writing = link is not None and (
-            (not established and session.over) or self._stalls.accepts(link)
-        )  # the last frames leave
+    def _write(self) -> tuple[float | None, float]:
+        """Write what is due; give when more is, None for never, and for how long bytes have waited, seconds."""
+        session, link, outbox = self.session, self.link, self.session.outbox
+        if link is None:
+            return None, 0.0
+        established, waited_s, writes_at = session.state is _ESTABLISHED, link.unacknowledged_s, None
+        last_words = not established and session.over  # these leave a stalled link too
+        if not last_words and (waited_s > (0.0 if self._blocked else STALLED_S)) is not self._blocked:
+            self._blocked = not self._blocked
+            self._hooks.stalled(self._blocked)
+        if self._blocked and not last_words:
+            return None, waited_s
         now = self._clock()
-        while writing and link is not None and link.ready and (not established or outbox.due(now)):
-            self._before()  # what becomes due while the process is frozen comes later: ``now`` is older
+        while link.ready:
+            writes_at = outbox.deadline()
+            if established and (writes_at is None or writes_at > now):
+                break
+            self._before()  # what becomes due while the process is frozen waits for its turn: ``now`` is older
             frame = session.outgoing(now)
             if frame is None:
+                writes_at = outbox.deadline()
                 break
             if type(frame) is Datagram:
                 link.write_datagram(frame)
@@ -241,94 +247,53 @@ class Conversation:
                 link.write(frame)
             now, established = self._clock(), session.state is _ESTABLISHED
             outbox.written(now)
-        self._notify()
-        if session.state is State.CLOSED:
-            self._end()
-        else:
-            ready = writing and link is not None and link.ready
-            self._set_timer(self._stalls.next(self._deadline(now, writing=ready), link))
+            waited_s = link.unacknowledged_s
+        return (writes_at if link.ready else None), waited_s
 
-    @_then_pump
+    @then_pump
     def close(self, reason: str) -> None:
         """End the conversation from our side."""
         self.session.close(reason, self._clock())
 
     @property
     def stalled(self) -> bool:
-        """Whether the kernel has not accepted all that was written."""
-        return self._link is not None and not self._link.ready
+        """Whether the kernel has not taken all that was written."""
+        return self.link is not None and not self.link.ready
 
-    @property
-    def unheard_s(self) -> float:
-        """Seconds since the link last received anything, or came up."""
-        return self._clock() - self._heard_at
-
-    @property
-    def connected_s(self) -> float:
-        """Age of the connection in seconds; 0 if there is none."""
-        return self._clock() - self.connected_at if self._link is not None and self.connected_at is not None else 0.0
-
-    @property
-    def silent_s(self) -> float:
-        """Seconds for which the peer's machine has not answered."""
-        return self._link.silent_s if self._link is not None else 0.0
-
-    @_then_pump
+    @then_pump
     def cut(self, reason: str) -> None:
         """End the conversation and its link at once, with a reason; what was written may be lost."""
         self.session.lost(reason)
-        if self._link is not None:
-            self._link.abort()
+        if self.link is not None:
+            self.link.abort()
 
     def abandon(self) -> None:
         """End the conversation and its link at once, in any state; idempotent."""
         self.session.lost("abandoned")
         self._end()
 
-    def pause_reading(self) -> None:
-        """Read nothing until :meth:`resume_reading`."""
-        self._reading.pause()
-
-    def resume_reading(self) -> None:
-        """Read again."""
-        self._reading.resume()
-
     # A restart
 
     @property
-    def suspended(self) -> bool:
-        """Whether nothing is read or written, and no timer runs: another process has the connection, or may get it."""
-        return self._reading.suspended
-
-    @suspended.setter
-    def suspended(self, suspended: bool) -> None:
-        self._reading.suspended = suspended
-
-    @property
-    def link(self) -> Link | None:
-        """The connection; None before there is one, and after it."""
-        return self._link
-
-    @property
     def blocker(self) -> str | None:
-        """Why the conversation cannot be handed to another process now; None if it can."""
-        link = self._link
+        """Why the conversation cannot be handed to another process now; None where it can."""
+        link = self.link
         if link is None or self.session.over:
             return "the connection is not up"
         return link.blocker or (None if link.ready else "the peer is stalled")
 
     def suspend(self) -> None:
-        """Read and write nothing, and run no timer, until :meth:`resume`."""
-        self.suspended = True
+        """Read and write nothing, and run no timer, until :meth:`resume`: another process may get the connection."""
+        self.reading.suspended = True
         self._set_timer(None)
-        if self._link is not None:
-            self._link.suspend()
+        if self.link is not None:
+            self.link.suspend()
 
     def resume(self) -> None:
         """Continue where :meth:`suspend` interrupted: this process has the connection."""
-        self.suspended = False
-        if self._link is not None:
-            self._link.resume()
+        self.reading.suspended = False
+        if self.link is not None:
+            self.link.resume()
         self.pump()
 
     def export(self, parcel: Parcel, budget: Budget | None = None) -> Exported:
@@ -336,23 +301,23 @@ class Conversation:
 
         budget: of a deposit; the conversation need not be suspended then.
         """
-        assert self._link is not None
+        assert self.link is not None
         return {
             "session": self.session.export(budget),
-            "link": self._link.export(parcel),
+            "link": self.link.export(parcel),
             "connected_at": self.connected_at,
         }
 
     def detach(self) -> None:
-        """Detach the connection, which another process has now: the peer notices nothing."""
-        self.suspended = True
+        """Forget the connection, which another process has now: the peer notices nothing."""
+        self.reading.suspended = True
         self._set_timer(None)
-        self._reading.end()
-        link, self._link = self._link, None
+        self.reading.end()
+        link, self.link = self.link, None
         if link is not None:
             link.detach()
 
-    @_then_pump
+    @then_pump
     def _tick(self) -> None:
         self._timer, due, now = None, self._timer_at, self._clock()
         if due is not None and due != self._reads_until and now > due + LATE_S:
@@ -360,13 +325,6 @@ class Conversation:
             self._reads_until = now + CATCH_UP_S
         elif now >= self._reads_until:
             self.session.expire(now)
-
-    def _deadline(self, now: float, *, writing: bool) -> float | None:
-        """Return the time of the next tick; ``writing`` False: the link is stalled now."""
-        if now >= self._reads_until:
-            return self.session.deadline(writing=writing)
-        writes_at = self.session.outbox.deadline() if writing else None
-        return self._reads_until if writes_at is None else min(writes_at, self._reads_until)
 
     def _set_timer(self, deadline: float | None) -> None:
         if self._timer is not None:
@@ -383,22 +341,13 @@ class Conversation:
         now = (self.session.state, self.session.busy, self.session.doubts)
         if now != self._seen:
             self._seen = now
-            self._changed()
+            self._hooks.changed()
 
     def _end(self) -> None:
         self._set_timer(None)
-        self._reading.end()
-        link, self._link = self._link, None
+        self.reading.end()
+        link, self.link = self.link, None
         if link is not None:
             link.close()
         if not self.ended.done():
             self.ended.set_result(None)
-
-    def _report_malformed(self) -> None:
-        """Warn at malformed messages 1, 2, 4, 8 ...: the log stays readable in a flood."""
-        count = self.session.traffic.malformed
-        self._malformed.value += count - self._malformed_logged
-        due = count.bit_length() != self._malformed_logged.bit_length()
-        if due and self._may_warn("warnings of malformed messages"):
-            log.warning("%s: %d malformed so far, last: %s", self.session.name, count, self.session.last_malformed)
-        self._malformed_logged = count

@@ -100,7 +100,7 @@ class Door:
         connection.setblocking(False)
         link = await make_link(connection, lambda: self._accept(receiver))
         if source is not None and self._hub is not None:
-            self._hub.bind(link, receiver, source)  # type: ignore[arg-type]
+            self._hub.bind(link, source)  # type: ignore[arg-type]
 
     def close(self) -> None:
         """Close the sockets of this process; idempotent."""

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from zbridge.protocol.kept import Exported
+from zbridge.transport.link import Link, Receiver
 from zbridge.transport.transferable import Parcel
 
 
-class FakeLink:
+class FakeLink(Link):
     """A link without a socket: keeps what was written, and the test plays the peer."""
 
-    def __init__(self, peer: str = "tcp://robot.test:1") -> None:
+    descriptors: tuple[int, ...] = ()
+    ready = True
+    silent_s = 0.0
+    unacknowledged_s = 0.0
+    blocker: str | None = None
+
+    def __init__(self, peer: str = "tcp://robot.test:1", receiver: Receiver | None = None) -> None:
+        super().__init__(receiver or Receiver())
         self.peer = peer
-        self.reads: Callable[[], object] = lambda: None
-        self.descriptors: tuple[int, ...] = ()
-        self.ready = True
-        self.silent_s = 0.0
-        self.unacknowledged_s = 0.0
         self.written: list[bytes] = []
         self.datagrams: list[bytes] = []
         self.sources_dropped = 0
@@ -26,50 +27,31 @@ class FakeLink:
         self.closed = False
 
     def write(self, data: bytes) -> None:
-        """Keep ``data``."""
         self.written.append(data)
 
     def write_datagram(self, data: bytes) -> None:
-        """Keep ``data``."""
         self.datagrams.append(data)
 
     def drop_source(self) -> None:
-        """Note the call."""
         self.sources_dropped += 1
 
     def pause_reading(self) -> None:
-        """Note the call."""
         self.paused = True
 
     def resume_reading(self) -> None:
-        """Note the call."""
         self.paused = False
 
-    blocker: str | None = None
-
     def suspend(self) -> None:
-        """Note the call."""
         self.suspended = True
 
     def resume(self) -> None:
-        """Note the call."""
         self.suspended = False
 
     def export(self, parcel: Parcel) -> Exported:
-        """Have nothing to hand over."""
         return {}
 
-    def detach(self) -> None:
-        """Note the call."""
-        self.closed = True
-
     def close(self) -> None:
-        """Note the call."""
         self.closed = True
 
     def abort(self) -> None:
-        """Note the call."""
         self.closed = True
-
-    async def ended(self) -> None:
-        """Return at once."""

@@ -13,17 +13,15 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 
 from zbridge.bus import Bus, BusSettings, Handle, PriorityClass, Publisher, ReadPayload, Sample, Sort, open_bus
-from zbridge.errors import BusError, LinkError, NotReady
+from zbridge.errors import BusError, LinkError
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address, ZenohAddress
-from zbridge.protocol.kept import Exported
 from zbridge.protocol.rate_limit import RateLimit
 from zbridge.protocol.samples import KeyedSample, SampleKind, dropped, read_sample, write_sample
-from zbridge.transport.link import Receiver
-from zbridge.transport.transferable import Parcel
+from zbridge.transport.link import Link, Receiver
 
 RATE_HZ = 2000.0
 """Samples a second of one subscription; more are dropped on Zenoh's own thread."""
@@ -33,17 +31,18 @@ REPORT_S = 0.5
 """Seconds between two reports: the time, and what was dropped."""
 
 
-class ZenohLink:
-    """One Zenoh session. Made by :func:`connect` and :func:`serve`; its receiver is notified when the session ends."""
+class ZenohLink(Link):
+    """One Zenoh session. Made by :func:`connect` and :func:`serve`; its receiver is told when the session ends."""
+
+    ready = True
 
     def __init__(self, peer: str, bus: Bus, metrics: Metrics, receiver: Receiver) -> None:
+        super().__init__(receiver)
         self.peer = peer
-        self.reads: Callable[[], object] = lambda: None
         self._bus = bus
         self._metrics = metrics
-        self._receiver = receiver
         self._loop = asyncio.get_running_loop()
-        self._open, self._paused = True, False
+        self._paused = False
         self._declared: dict[tuple[SampleKind, str], Handle] = {}
         self._publishers: dict[str, Publisher] = {}
         self._above = 0
@@ -58,22 +57,14 @@ class ZenohLink:
 
     def begin(self, *, ends: bool) -> None:
         """Attach the receiver and report that the session is open. ends: the link ends with its last connection."""
-        self._receiver.attached(self)
+        self.receiver.attached(self)
         if ends:
             self._bus.watch_connected(self._on_connected)
         self._report()
 
-    @property
-    def ready(self) -> bool:
-        """Whether the session is open."""
-        return self._open
-
-    silent_s = 0.0
-    unacknowledged_s = 0.0
-
     def write(self, data: bytes) -> None:
-        """Carry out one frame. Raises ProtocolError for one that is invalid, LinkError above :data:`DECLARED` keys."""
-        if not self._open:
+        """Carry out one frame. Raises ProtocolError for one that cannot be, LinkError above :data:`DECLARED` keys."""
+        if not self.ready:
             return
         sample = read_sample(data)
         if sample.kind in (SampleKind.PUT, SampleKind.KEEP):
@@ -89,52 +80,21 @@ class ZenohLink:
             self._bounded(len(self._declared))
             self._declared[sample.kind, sample.key] = self._declare(sample)
 
-    def write_datagram(self, data: bytes) -> None:
-        """Drop ``data``: there are no datagrams."""
-
-    def drop_source(self) -> None:
-        """Do nothing: there is no source of datagrams."""
-
     def pause_reading(self) -> None:
         """Drop and count what comes, until :meth:`resume_reading`: Zenoh cannot be asked to wait."""
         self._paused = True
 
     def resume_reading(self) -> None:
-        """Read again."""
         self._paused = False
 
     @property
-    def descriptors(self) -> tuple[int, ...]:
-        """None: Zenoh keeps its sockets to itself."""
-        return ()
-
-    @property
     def blocker(self) -> str | None:
-        """Why this link cannot be handed to another process."""
         return "a Zenoh session stays in its process"
 
-    def suspend(self) -> None:
-        """Drop and count what comes, until :meth:`resume`."""
-        self.pause_reading()
-
-    def resume(self) -> None:
-        """Read again, after :meth:`suspend`."""
-        self.resume_reading()
-
-    def export(self, parcel: Parcel) -> Exported:
-        """Raise NotReady: see :attr:`blocker`."""
-        raise NotReady(str(self.blocker))
-
-    def detach(self) -> None:
-        """Close the session: no other process can have it."""
-        self.close()
-
     def close(self) -> None:
-        """Close the session; idempotent."""
         self._end("closed")
 
     def abort(self) -> None:
-        """Close the session; idempotent."""
         self._end("closed")
 
     async def ended(self) -> None:
@@ -194,18 +154,18 @@ class ZenohLink:
                 self._on_token(token, here=True)
 
     def _feed(self, sample: KeyedSample) -> None:
-        if not self._open:
+        if not self.ready:
             return
         try:
             frame = write_sample(sample)
         except Exception:  # a key, an attachment or a payload beyond all bounds
             self._above += 1
             return
-        self._receiver.received(frame)
+        self.receiver.received(frame)
 
     def _report(self) -> None:
         """Tell the time, and what was dropped since."""
-        if not self._open:
+        if not self.ready:
             return
         self._timer = self._loop.call_later(REPORT_S, self._report)
         lost = self._above + self._metrics.total("bus_in_dropped")
@@ -219,9 +179,9 @@ class ZenohLink:
             self._end("connection lost: the router is gone")
 
     def _end(self, reason: str) -> None:
-        if not self._open:
+        if not self.ready:
             return
-        self._open = False
+        self.ready = False
         if self._timer is not None:
             self._timer.cancel()
         for looking in self._looking.values():
@@ -229,7 +189,7 @@ class ZenohLink:
         self._closing = self._loop.create_task(self._bus.close())
         _closing.add(self._closing)
         self._closing.add_done_callback(_closing.discard)
-        self._loop.call_soon(self._receiver.lost, reason)
+        self._loop.call_soon(self.receiver.lost, reason)
 
 
 def _unheard(listened: bool) -> None:

@@ -14,14 +14,13 @@ import os
 import struct
 import termios
 import time
-from collections.abc import Callable
 from typing import Any
 
 from zbridge.errors import LinkError
 from zbridge.protocol.address import SerialAddress
 from zbridge.protocol.kept import Exported
 from zbridge.transport.backlog import Backlog
-from zbridge.transport.link import STALLED_S, Receiver
+from zbridge.transport.link import STALLED_S, Link, Receiver
 from zbridge.transport.transferable import Parcel
 
 READ_BYTES = 4096
@@ -33,8 +32,8 @@ POLL_S = 0.01
 _INT = struct.Struct("=i")
 
 
-class SerialLink:
-    """A serial line. Made by :func:`connect`; a line that fails is closed and its receiver notified.
+class SerialLink(Link):
+    """A serial line. Made by :func:`connect`; a line that fails is closed and its receiver told so.
 
     What the driver does not take at once waits here, and ``ready`` is False meanwhile: one write at most, as long as
     the caller writes only while ``ready`` is True. A write counts as acknowledged when its bytes have left the
@@ -42,11 +41,10 @@ class SerialLink:
     """
 
     def __init__(self, address: SerialAddress, port: Any, receiver: Receiver) -> None:
+        super().__init__(receiver)
         self.peer = str(address)
-        self.reads: Callable[[], object] = lambda: None
         self._port = port
         self._fd: int = port.fileno()
-        self._receiver = receiver
         self._loop = asyncio.get_running_loop()
         self._backlog = Backlog()
         self._unwritten = b""
@@ -61,11 +59,10 @@ class SerialLink:
     def begin(self) -> None:
         """Attach the receiver and begin to read; called once."""
         self.resume_reading()
-        self._receiver.attached(self)
+        self.receiver.attached(self)
 
     @property
     def descriptors(self) -> tuple[int, ...]:
-        """The line's file descriptor."""
         return (self._fd,) if self._open else ()
 
     @property
@@ -74,7 +71,6 @@ class SerialLink:
         return self._open and self._close_by is None and not self._unwritten
 
     def write(self, data: bytes) -> None:
-        """Write ``data`` after what waits."""
         if not self._open or self._close_by is not None:
             return
         self._backlog.written(len(data), time.monotonic())
@@ -84,17 +80,6 @@ class SerialLink:
             self._write(data)
             if self._unwritten:
                 self._loop.add_writer(self._fd, self._write_on)
-
-    def write_datagram(self, data: bytes) -> None:
-        """Drop ``data``: a serial line carries no datagrams."""
-
-    def drop_source(self) -> None:
-        """Do nothing: a serial line has no source of datagrams."""
-
-    @property
-    def silent_s(self) -> float:
-        """0: a serial line does not tell whether anybody is at its other end."""
-        return 0.0
 
     @property
     def unacknowledged_s(self) -> float:
@@ -108,29 +93,20 @@ class SerialLink:
         return backlog.waited_s(now)
 
     def pause_reading(self) -> None:
-        """Read nothing until :meth:`resume_reading`."""
         if self._reading:
             self._reading = False
             self._loop.remove_reader(self._fd)
 
     def resume_reading(self) -> None:
-        """Read again."""
         if self._open and self._close_by is None and not self._reading and not self._suspended:
             self._reading = True
             self._loop.add_reader(self._fd, self._read)
 
-    @property
-    def blocker(self) -> str | None:
-        """None: a line can be handed over."""
-        return None
-
     def suspend(self) -> None:
-        """Read nothing until :meth:`resume`."""
         self._suspended = True
         self.pause_reading()
 
     def resume(self) -> None:
-        """Read again."""
         self._suspended = False
         self.resume_reading()
 
@@ -153,24 +129,20 @@ class SerialLink:
             self._close_when_sent()
 
     def abort(self) -> None:
-        """Close the line now, whatever was written; idempotent."""
         self._end("closed")
-
-    async def ended(self) -> None:
-        """Return at once: such a link has no threads."""
 
     def _read(self) -> None:
         self.reads()
         try:
             data = os.read(self._fd, READ_BYTES)
         except (BlockingIOError, InterruptedError):
-            self._receiver.received(b"")  # who watches the reads learns that nothing was taken
+            self.receiver.received(b"")  # who watches the reads learns that nothing was taken
             return
         except OSError as error:
             self._end(f"connection lost: {error.strerror or error}")
             return
         if data:
-            self._receiver.received(data)
+            self.receiver.received(data)
         else:  # Linux shows an unplugged device as one that is always readable and has nothing to read
             self._end("connection lost: the device is gone")
 
@@ -188,7 +160,7 @@ class SerialLink:
         if self._open and not self._unwritten:
             self._loop.remove_writer(self._fd)
             if self._close_by is None:
-                self._receiver.writable()
+                self.receiver.writable()
 
     def _close_when_sent(self) -> None:
         """Poll until the output queue is empty, or time is up: the kernel itself would block in ``close``."""
@@ -219,7 +191,7 @@ class SerialLink:
         self._open, self._unwritten = False, b""
         with contextlib.suppress(OSError):
             self._port.close()
-        self._loop.call_soon(self._receiver.lost, reason)
+        self._loop.call_soon(self.receiver.lost, reason)
 
 
 def connect(address: SerialAddress, receiver: Receiver) -> SerialLink:

@@ -18,10 +18,10 @@ from zbridge.errors import LinkError
 from zbridge.metrics import Count
 from zbridge.protocol.address import Address
 from zbridge.protocol.kept import Exported
-from zbridge.transport.backlog import Backlog
+from zbridge.transport.backlog import LEAST_S, Backlog
 from zbridge.transport.door import Door, make_link
 from zbridge.transport.kernel import KERNEL, Kernel
-from zbridge.transport.link import NOBODY, STALLED_S, Receiver
+from zbridge.transport.link import STALLED_S, Link, Receiver, unwatched
 from zbridge.transport.tcp_options import KEEPALIVE_S, bound_retries, keep_alive, new_backlog, outstanding, tune
 from zbridge.transport.transferable import Parcel
 from zbridge.transport.udp import DatagramHub, DatagramSocket
@@ -48,17 +48,16 @@ CONNECT_S = 5.0
 """Seconds that a connection attempt may take."""
 
 
-def _unwatched() -> None:
-    """Do nothing: nobody watches the reads of the link."""
-
-
-class TcpLink(asyncio.BufferedProtocol):
+class TcpLink(asyncio.BufferedProtocol, Link):
     """A TCP connection. ``hub``: the listener's UDP socket, if the peer was accepted there.
 
     ``buffer``: receives what is read; :data:`READ_BYTES` of its own by default. Reads are copied at once, so all links
     of a loop may share it. ``accepted``: by a listener. ``restored_udp``: the socket for datagrams to a robot, if
     another process handed the connection over.
     """
+
+    ready = False
+    """Whether the kernel took all that was written."""
 
     def __init__(
         self,
@@ -70,38 +69,28 @@ class TcpLink(asyncio.BufferedProtocol):
         restored_udp: socket.socket | None = None,
         kernel: Kernel = KERNEL,
     ) -> None:
+        super().__init__(receiver)
         self._kernel = kernel
-        self.peer = ""
-        self.reads: Callable[[], object] = _unwatched
         self._restored_udp = restored_udp
         self._backlog: Backlog | None = None
         self._hub = hub
         self._accepted = accepted
         self._datagrams: DatagramSocket | None = None
-        self._receiver = receiver
         self._transport: asyncio.Transport | None = None
         self._view = memoryview(bytearray(READ_BYTES) if buffer is None else buffer)
-        self._writing_paused = False
 
     def __repr__(self) -> str:
         return f"<TcpLink {self.peer or 'unconnected'}>"
 
     @property
     def descriptors(self) -> tuple[int, ...]:
-        """File descriptors of the stream, and of our own socket for datagrams if there is one."""
         if self._transport is None:
             return ()
         stream: int = self._transport.get_extra_info("socket").fileno()
         datagrams = self._datagrams.fileno() if self._datagrams is not None else -1
         return tuple(number for number in (stream, datagrams) if number >= 0)
 
-    @property
-    def ready(self) -> bool:
-        """Whether the kernel accepted all that was written."""
-        return self._transport is not None and not self._writing_paused
-
     def write(self, data: bytes) -> None:
-        """Write ``data`` as one segment."""
         if self._transport is not None:
             if self._backlog is not None:
                 self._backlog.written(len(data), self._kernel.monotonic())
@@ -118,20 +107,18 @@ class TcpLink(asyncio.BufferedProtocol):
         elif self._transport is not None:
             if self._datagrams is None:
                 try:
-                    self._datagrams = DatagramSocket(self._transport, self._receiver, kernel=self._kernel)
+                    self._datagrams = DatagramSocket(self._transport, self, kernel=self._kernel)
                 except OSError as error:  # no descriptor, no port: the datagram is lost, the next one tries again
                     log.warning("%s: no socket for datagrams: %s", self.peer, error)
                     return
             self._datagrams.send(data)
 
     def drop_source(self) -> None:
-        """Forget which source an accepted peer's datagrams come from; idempotent."""
         if self._hub is not None:
             self._hub.unbind(self)
 
     @property
     def silent_s(self) -> float:
-        """Seconds for which the peer's machine has not answered: it is unplugged, or its network fails."""
         if self._transport is None or not hasattr(socket, "TCP_INFO"):
             return 0.0
         sock = self._transport.get_extra_info("socket")
@@ -144,22 +131,21 @@ class TcpLink(asyncio.BufferedProtocol):
 
     @property
     def unacknowledged_s(self) -> float:
-        """Seconds for which the oldest written byte has waited for its acknowledgement; see :class:`Link`."""
         backlog, transport = self._backlog, self._transport
         if backlog is None or backlog.since is None or transport is None:
             return 0.0
         now = self._kernel.monotonic()
-        if now - backlog.since > STALLED_S:
-            backlog.settle(outstanding(transport, self._kernel))
+        waited_s = now - backlog.since
+        if waited_s <= STALLED_S:
+            return max(waited_s, LEAST_S)
+        backlog.settle(outstanding(transport, self._kernel))
         return backlog.waited_s(now)
 
     def pause_reading(self) -> None:
-        """Read nothing until :meth:`resume_reading`."""
         if self._transport is not None and self._transport.is_reading():
             self._transport.pause_reading()
 
     def resume_reading(self) -> None:
-        """Read again."""
         if self._transport is not None and not self._transport.is_reading():
             self._transport.resume_reading()
 
@@ -170,13 +156,11 @@ class TcpLink(asyncio.BufferedProtocol):
         return "a tls connection cannot be handed over" if tls else None
 
     def suspend(self) -> None:
-        """Read nothing, neither stream nor datagrams of our own socket, until :meth:`resume`."""
         self.pause_reading()
         if self._datagrams is not None:
             self._datagrams.suspend()
 
     def resume(self) -> None:
-        """Read again, after :meth:`suspend`."""
         self.resume_reading()
         if self._datagrams is not None:
             self._datagrams.resume()
@@ -188,8 +172,8 @@ class TcpLink(asyncio.BufferedProtocol):
         return {"tcp": parcel.put(self._transport.get_extra_info("socket").fileno()), "udp": udp}
 
     def detach(self) -> None:
-        """Close our descriptors of a connection that another process has now: no FIN is sent."""
-        self._receiver = NOBODY
+        """Give up the own descriptors of a connection that another process has now: no FIN is sent."""
+        self.receiver = Receiver()
         self.abort()
 
     def close(self) -> None:
@@ -197,21 +181,18 @@ class TcpLink(asyncio.BufferedProtocol):
         transport = self._transport
         if transport is not None and not transport.is_closing():
             transport.close()
-            if self._writing_paused:
+            if not self.ready:
                 asyncio.get_running_loop().call_later(CLOSE_S, self.abort)
 
     def abort(self) -> None:
-        """Close the connection now; what was written may be lost. Idempotent."""
         if self._transport is not None:
             self._transport.abort()
 
     # What asyncio calls
 
-    async def ended(self) -> None:
-        """Return at once: such a link has no threads."""
-
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast(asyncio.Transport, transport)  # uvloop's transport does not inherit from it
+        self.ready = True
         self._transport.set_write_buffer_limits(high=0)  # makes uvloop write at once, not at the end of its iteration
         peer = transport.get_extra_info("peername")
         if peer is None:  # already reset; connection_lost follows
@@ -227,11 +208,11 @@ class TcpLink(asyncio.BufferedProtocol):
             bound_retries(sock)
             self._backlog = new_backlog(sock, self._kernel)
             if self._restored_udp is not None:
-                self._datagrams = DatagramSocket(self._transport, self._receiver, self._restored_udp, self._kernel)
+                self._datagrams = DatagramSocket(self._transport, self, self._restored_udp, self._kernel)
                 self._datagrams.resume()
         if self._hub is not None:
-            self._hub.add(self, peer[0], self._receiver)
-        self._receiver.attached(self)
+            self._hub.add(self, peer[0])
+        self.receiver.attached(self)
 
     def get_buffer(self, sizehint: int) -> memoryview:
         self.reads()
@@ -240,32 +221,32 @@ class TcpLink(asyncio.BufferedProtocol):
     def buffer_updated(self, nbytes: int) -> None:
         data = bytes(self._view[:nbytes])
         if self._hub is not None:
-            self._hub.drain()  # waiting datagrams are older: an old drive must not follow a newer stop
-        self._receiver.received(data)
-        if nbytes == len(self._view) and self.reads is not _unwatched:
-            # libuv reads once more, often in vain: report to the watcher of reads that nothing was read.
+            self._hub.drain()  # datagrams that wait are older: an old drive must not follow a newer stop
+        self.receiver.received(data)
+        if nbytes == len(self._view) and self.reads is not unwatched:
+            # libuv reads once more, often in vain: who watches the reads must learn that nothing was taken.
             asyncio.get_running_loop().call_soon(self._read_in_vain)
 
     def _read_in_vain(self) -> None:
-        self._receiver.received(b"")
+        self.receiver.received(b"")
 
     def eof_received(self) -> bool:
         return False
 
     def pause_writing(self) -> None:
-        self._writing_paused = True
+        self.ready = False
 
     def resume_writing(self) -> None:
-        self._writing_paused = False
-        self._receiver.writable()
+        self.ready = self._transport is not None
+        self.receiver.writable()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._transport = None
+        self._transport, self.ready = None, False
         if self._datagrams is not None:
             self._datagrams.close()
         if self._hub is not None:
             self._hub.remove(self)
-        self._receiver.lost(f"connection lost: {exc}" if exc else "closed by peer")
+        self.receiver.lost(f"connection lost: {exc}" if exc else "closed by peer")
 
 
 async def connect(

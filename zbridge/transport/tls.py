@@ -11,12 +11,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import ssl
-from collections.abc import Callable
 
-from zbridge.errors import LinkError, NotReady
-from zbridge.protocol.kept import Exported
+from zbridge.errors import LinkError
 from zbridge.transport.link import Link, Receiver
-from zbridge.transport.transferable import Parcel
 
 _READ_BYTES = 16_384
 """Most bytes of one TLS record."""
@@ -43,16 +40,14 @@ def server_context(certificate: str, key: str, ca: str | None = None) -> ssl.SSL
     return context
 
 
-class TlsLink(Receiver):
+class TlsLink(Link, Receiver):
     """The server's end of TLS over a link. Is the link of ``receiver``, and the receiver of the TCP link.
 
     handshake_s: how long the peer may take for the handshake, seconds.
     """
 
     def __init__(self, receiver: Receiver, context: ssl.SSLContext, handshake_s: float) -> None:
-        self.peer = ""
-        self.reads: Callable[[], object] = lambda: None
-        self._receiver = receiver
+        super().__init__(receiver)
         self._handshake_s = handshake_s
         self._incoming, self._outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
         self._tls = context.wrap_bio(self._incoming, self._outgoing, server_side=True)
@@ -74,12 +69,10 @@ class TlsLink(Receiver):
 
     @property
     def silent_s(self) -> float:
-        """Seconds for which the peer's machine has not answered."""
         return self._link.silent_s if self._link is not None else 0.0
 
     @property
     def unacknowledged_s(self) -> float:
-        """Seconds for which the oldest written byte has waited for its acknowledgement."""
         return self._link.unacknowledged_s if self._link is not None else 0.0
 
     def write(self, data: bytes) -> None:
@@ -88,25 +81,16 @@ class TlsLink(Receiver):
             self._tls.write(data)
             self._flush()
 
-    def write_datagram(self, data: bytes) -> None:
-        """Drop the datagram: it would be sent unencrypted."""
-
-    def drop_source(self) -> None:
-        """Do nothing: there are no datagrams."""
-
     def pause_reading(self) -> None:
-        """Read nothing until :meth:`resume_reading`."""
         if self._link is not None:
             self._link.pause_reading()
 
     def resume_reading(self) -> None:
-        """Read again."""
         if self._link is not None:
             self._link.resume_reading()
 
     @property
     def descriptors(self) -> tuple[int, ...]:
-        """The file descriptor of the stream; empty while there is no link."""
         return self._link.descriptors if self._link is not None else ()
 
     @property
@@ -114,26 +98,7 @@ class TlsLink(Receiver):
         """Why this connection cannot be handed to another process: the keys of TLS stay in this one."""
         return "encrypted by this process"
 
-    def suspend(self) -> None:
-        """Read nothing until :meth:`resume`."""
-        if self._link is not None:
-            self._link.suspend()
-
-    def resume(self) -> None:
-        """Read again, after :meth:`suspend`."""
-        if self._link is not None:
-            self._link.resume()
-
-    def export(self, parcel: Parcel) -> Exported:
-        """Raise NotReady: see :attr:`blocker`."""
-        raise NotReady(f"the connection is {self.blocker}")
-
-    def detach(self) -> None:
-        """Close the connection: no other process can have it."""
-        self.close()
-
     def close(self) -> None:
-        """Close the connection after what was written; idempotent."""
         link, self._link = self._link, None
         if link is not None:
             if self._open:
@@ -141,25 +106,20 @@ class TlsLink(Receiver):
             link.close()
 
     def abort(self) -> None:
-        """Close the connection now; what was written may be lost. Idempotent."""
         link, self._link = self._link, None
         if link is not None:
             link.abort()
 
     # What the TCP link calls
 
-    async def ended(self) -> None:
-        """Return at once: such a link has no threads."""
-
     def attached(self, link: Link) -> None:
         """Begin: the connection is up, the handshake is not done."""
         self._link = link
         self.peer = link.peer.replace("tcp://", "tls://", 1)
         self._timer = asyncio.get_running_loop().call_later(self._handshake_s, self._on_late)
-        self._receiver.attached(self)
+        self.receiver.attached(self)
 
     def received(self, data: bytes) -> None:
-        """Take encrypted bytes."""
         if self._link is None:
             return
         self._incoming.write(data)
@@ -171,45 +131,27 @@ class TlsLink(Receiver):
                 if not plain:
                     self._fail("closed by peer")
                 else:
-                    self._receiver.received(plain)
+                    self.receiver.received(plain)
         except ssl.SSLWantReadError:
             self._flush()
         except ssl.SSLError as error:
             self._fail(f"TLS: {_said(error)}")
 
     def lost(self, reason: str) -> None:
-        """End: the connection is gone."""
         self._link = None
         self._stop_timer()
-        self._receiver.lost(self._why or reason)
+        self.receiver.lost(self._why or reason)
 
     def writable(self) -> None:
-        """Resume writing."""
         if self._open:
-            self._receiver.writable()
-
-    def received_datagram(self, datagram: bytes) -> None:
-        """Never called: there are no datagrams."""
-
-    def claims(self, datagram: bytes, port: int) -> bool:
-        """Never called: there are no datagrams."""
-        return False
-
-    def rivalled(self) -> None:
-        """Never called: there are no datagrams."""
-
-    def stray_datagram(self, datagram: bytes) -> None:
-        """Never called: there are no datagrams."""
-
-    def foreign_datagram(self) -> None:
-        """Never called: there are no datagrams."""
+            self.receiver.writable()
 
     def _shake_hands(self) -> None:
         self._tls.do_handshake()
         self._flush()
         self._open = True
         self._stop_timer()
-        self._receiver.writable()
+        self.receiver.writable()
 
     def _flush(self) -> None:
         if self._link is not None and self._outgoing.pending:

@@ -12,7 +12,7 @@ import socket
 from zbridge.metrics import Count
 from zbridge.protocol.rate_limit import RateLimit
 from zbridge.transport.kernel import KERNEL, Kernel
-from zbridge.transport.link import Link, Receiver
+from zbridge.transport.link import Link
 
 _DATAGRAM_BYTES = 65_536
 _DATAGRAMS = 64
@@ -98,13 +98,13 @@ class DatagramSocket(_DatagramReader):
     def __init__(
         self,
         transport: asyncio.Transport,
-        receiver: Receiver,
+        link: Link,
         restored: socket.socket | None = None,
         kernel: Kernel = KERNEL,
     ) -> None:
         """``restored``: the socket of another process, that was suspended."""
         super().__init__(kernel)
-        self._receiver = receiver
+        self._link = link
         self._peer: tuple[str, int] = transport.get_extra_info("peername")[:2]
         if restored is not None:
             self.restore(restored)
@@ -117,9 +117,9 @@ class DatagramSocket(_DatagramReader):
 
     def _take(self, data: bytes, source: tuple[str, int]) -> None:
         if source == self._peer:
-            self._receiver.received_datagram(data)
+            self._link.receiver.received_datagram(data)
         else:
-            self._receiver.foreign_datagram()
+            self._link.receiver.foreign_datagram()
 
 
 class DatagramHub(_DatagramReader):
@@ -132,10 +132,10 @@ class DatagramHub(_DatagramReader):
 
     def __init__(self, foreign: Count, kernel: Kernel = KERNEL) -> None:
         super().__init__(kernel)
-        self._hosts: dict[str, dict[Link, Receiver]] = {}
+        self._hosts: dict[str, dict[Link, None]] = {}
         self._strays: dict[str, RateLimit] = {}
         self._deaf_until: dict[tuple[str, int], float] = {}
-        self._owners: dict[tuple[str, int], tuple[Link, Receiver]] = {}
+        self._owners: dict[tuple[str, int], Link] = {}
         self._sources: dict[Link, tuple[str, int]] = {}
         self._foreign = foreign
 
@@ -143,9 +143,9 @@ class DatagramHub(_DatagramReader):
         """Bind the port."""
         self._listen(host, port)
 
-    def add(self, link: Link, host: str, receiver: Receiver) -> None:
-        """Offer this link the unclaimed datagrams of its host from now on."""
-        self._hosts.setdefault(host, {})[link] = receiver
+    def add(self, link: Link, host: str) -> None:
+        """Ask this link for the datagrams of its host from now on."""
+        self._hosts.setdefault(host, {})[link] = None
         self._strays.setdefault(host, RateLimit(STRAYS_HZ))
 
     def remove(self, link: Link) -> None:
@@ -166,10 +166,10 @@ class DatagramHub(_DatagramReader):
         """Return the source that is the link's."""
         return self._sources.get(link)
 
-    def bind(self, link: Link, receiver: Receiver, source: tuple[str, int]) -> None:
-        """Assign a source to the link, as it was in another process."""
+    def bind(self, link: Link, source: tuple[str, int]) -> None:
+        """Let a source be the link's."""
         self._sources[link] = source
-        self._owners[source] = (link, receiver)
+        self._owners[source] = link
 
     def send(self, link: Link, data: bytes) -> None:
         """Send to the source of a link; without a source the datagram is lost."""
@@ -180,25 +180,24 @@ class DatagramHub(_DatagramReader):
     def _take(self, data: bytes, source: tuple[str, int]) -> None:
         owner = self._owners.get(source)
         if owner is not None:
-            owner[1].received_datagram(data)
+            owner.receiver.received_datagram(data)
             return
         now = self._loop.time()
         if now < self._deaf_until.get(source, now):
             self._foreign.value += 1
             return
-        peers = tuple(self._hosts.get(source[0], {}).items())
-        claiming = [(link, receiver) for link, receiver in peers if receiver.claims(data, source[1])]
-        if len(claiming) == 1 and claiming[0][0] not in self._sources:
-            self._sources[claiming[0][0]] = source
-            self._owners[source] = claiming[0]
-            claiming[0][1].received_datagram(data)
+        links = tuple(self._hosts.get(source[0], ()))
+        claiming = [link for link in links if link.receiver.claims(data, source[1])]
+        if len(claiming) == 1 and claiming[0] not in self._sources:
+            self.bind(claiming[0], source)
+            claiming[0].receiver.received_datagram(data)
             return
         self._foreign.value += 1
         if claiming:
-            for link, receiver in claiming:
+            for link in claiming:
                 self.unbind(link)
-                receiver.rivalled()
-        elif peers:
+                link.receiver.rivalled()
+        elif links:
             self._note_stray(data, source, now)
 
     def _note_stray(self, data: bytes, source: tuple[str, int], now: float) -> None:
@@ -207,5 +206,5 @@ class DatagramHub(_DatagramReader):
             self._deaf_until.clear()
         self._deaf_until[source] = now + STRAY_S
         if self._strays[source[0]].take(now):
-            for receiver in tuple(self._hosts[source[0]].values()):
-                receiver.stray_datagram(data)
+            for link in tuple(self._hosts[source[0]]):
+                link.receiver.stray_datagram(data)

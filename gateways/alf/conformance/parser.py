@@ -129,7 +129,6 @@ class _AlfReader(MessageReader[ParsedAlfMessage]):
         self._layouts = {kind: _layout(kind, count) for kind, count in counts.items()}
 
     def take(self, data: bytes) -> list[ParsedAlfMessage]:
-        """Read the messages that end in ``data``."""
         if self._dialect == "binary":
             return super().take(data)
         *texts, self.rest = (self.rest + data).split(b";")

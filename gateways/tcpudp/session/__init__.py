@@ -1,6 +1,6 @@
 """Conversations of the TCP/UDP package protocol: framing, ``id`` bytes and channels, as both roles share them. Sans-IO.
 
-``hq_role`` plays HQ towards a robot, with the handshake of ``hq_handshake``; ``robot_role`` plays the robot towards an
+``hq_role`` plays HQ towards a robot; ``robot_role`` plays the robot towards an
 HQ program. Source: "Framing" and "Packets" of the protocol page.
 """
 

@@ -42,6 +42,7 @@ from zbridge.protocol import (
     NotReady,
     ProtocolError,
     Role,
+    SourceClaims,
     State,
     Unsupported,
     agree,
@@ -153,7 +154,7 @@ class RobotEvent(Enum):
     TIMEOUT = "the step lasts too long"
 
 
-class RobotRole(PacketSession):
+class RobotRole(PacketSession, SourceClaims):
     """One conversation with an HQ program.
 
     ``settings``: announced; ``block``: the settings block as sent, default that of ``settings``; ``client_id``: given

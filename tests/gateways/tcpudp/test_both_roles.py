@@ -84,7 +84,7 @@ class Network:
 
     def _arrive(self, end: Timed, sent: Sent) -> None:
         self.heard.append((self.now, end, sent))
-        if end.session.drops_source:
+        if end is self.robot and end.session.drops_source:
             end.session.drops_source = self._claimed[end] = False
         claimed = sent.by == "tcp" or self._claimed[end] or end.session.claims(sent.frame, 11000)
         if claimed:  # a listener drops what no session has claimed

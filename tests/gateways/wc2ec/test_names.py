@@ -14,11 +14,13 @@ from zbridge.bus import Publisher
 from zbridge.bus.fake import FakeBus
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
+from zbridge.control.context import Conditions, Faults, RobotContext
 from zbridge.fleet.topics import KeySpace, Topic
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.protocol.session_table import SessionTable
-from zbridge.robot.device import RobotDevice
+from zbridge.robot.connection import LinkSettings
+from zbridge.robot.device import ControlParts, RobotDevice
 from zbridge.robot.names import HOUR_S, NAMES
 from zbridge.transport.conversation import Conversation
 from zbridge.transport.fake import FakeLink
@@ -57,16 +59,18 @@ class Webots:
         self.bus, self.metrics, self.connected = CountingBus(), Metrics(), asyncio.Event()
         self.conversation: Conversation
         self.device = RobotDevice(
-            Wc2EcRobot(Wc2EcOptions()),
-            (Address("robot.test", 27015),),
-            protocol="wc2ec",
-            keys=KeySpace("fleet", "r1"),
-            bus=self.bus,
-            authority=Authority(3.0, 2.0, lambda: bytes(16)),
-            manager=SessionTable(),
-            metrics=self.metrics,
-            audit=Audit("r1", lambda line: None),
-            connect=self._connect,
+            RobotContext(
+                Wc2EcRobot(Wc2EcOptions()),
+                KeySpace("fleet", "r1"),
+                self.bus,
+                self.metrics,
+                Conditions(),
+                Faults("r1"),
+                clock=asyncio.get_running_loop().time,
+            ),
+            "wc2ec",
+            LinkSettings(addresses=(Address("robot.test", 27015),), sessions=SessionTable(), connect=self._connect),
+            ControlParts(authority=Authority(3.0, 2.0, lambda: bytes(16)), audit=Audit("r1", lambda line: None)),
         )
 
     async def _connect(self, address: Address, conversation: Conversation) -> None:

@@ -145,11 +145,9 @@ class ZenohQuery:
         return f"<ZenohQuery {self.asked}>"
 
     def answer(self, payload: bytes, attachment: bytes | None = None) -> None:
-        """Reply with a payload."""
         self._writer.put(lambda: reply_and_drop(self._query, self.key, payload, attachment))
 
     def refuse(self, refusal: Refused) -> None:
-        """Reply with an error: its code, and its text."""
         denied = payloads.encode(Denied(code=refusal.code, reason=str(refusal)))
         self._writer.put(lambda: self._refuse(denied))
 

@@ -83,7 +83,6 @@ class PlainPublisher(Declared):
         self._writer = writer
 
     def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
-        """Publish one message."""
         if self._writer is not None:
             return self._writer.put(lambda: self._put(payload, attachment=attachment))
         self._put(payload, attachment=attachment)
@@ -133,7 +132,6 @@ class FramePublisher(Declared):
         super().__init__(matching, *publishers)
 
     def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
-        """Publish one frame."""
         return self._writer.put_at_once(partial(self._put, payload, attachment=attachment), 1)
 
 

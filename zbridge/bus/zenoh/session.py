@@ -118,26 +118,18 @@ class ZenohBus:
 
     @property
     def zid(self) -> str:
-        """The id of the Zenoh session."""
         return str(self._session.zid())
 
     def routers(self) -> list[str]:
-        """Return the ids of the routers that this session is connected to."""
         return [str(zid) for zid in self._session.info.routers_zid()]
 
     def share(self, metrics: Metrics) -> ZenohBus:
-        """Return a bus on the same session for one robot, with queues, bounds, threads and declarations of its own.
-
-        Its ``close`` undeclares what was declared on it, and leaves the session to the others.
-        """
         return ZenohBus(self._session, self._loop, metrics, stream=self._stream, threads=self._threads, beside=self)
 
     def publisher(self, key: str, topic: Topic, last: bytes | None = None) -> Publisher:
-        """Declare a publisher of ``key``. last: what another process published last, for keys that keep it."""
         return self._keep(self._publishers.make(key, topic, last))
 
     def on_relief(self, handler: Callable[[], None]) -> None:
-        """Call ``handler`` when a paused source may resume."""
         self._relief.append(handler)
 
     def subscribe(
@@ -150,15 +142,6 @@ class ZenohBus:
         kept: bool = False,
         direct: bool = False,
     ) -> Handle:
-        """Subscribe to ``key_expr``.
-
-        priority: of all samples, or a Sort that chooses it for each. history: query last values too.
-        kept: also receive the frames that publishers keep, including publishers that appear later.
-        direct: the handler is called on one of Zenoh's threads, for streams without priority and history: it must be
-        quick, and may put frames on another bus.
-
-        Of the samples that a Sort gives priority STOP only one waits at a time, because they are all the same stop.
-        """
         if history:
             return self._keep(LateJoin(self, key_expr, handler))
         store: Any = direct_callback(key_expr, handler) if direct else loop_callback(self._inbox, handler, priority)
@@ -176,10 +159,6 @@ class ZenohBus:
         priority: PriorityClass | Sort = PriorityClass.OTHER,
         complete: bool = False,
     ) -> Handle:
-        """Answer queries that ask for ``key``, with or without wildcards; the last chunk of ``key`` may be one.
-
-        complete: this session answers for the whole key, so that queries to complete answerers alone find it.
-        """
         writer = self._writer
         source = self._inbox.source(handler, lambda raw: ZenohQuery(raw, key, writer))
         store = query_callback(
@@ -192,11 +171,9 @@ class ZenohBus:
         return self._keep(self._answers.add(key, store))
 
     def gather(self, key_expr: str) -> Handle:
-        """Declare one queryable, ``key_expr``, for all keys below it that are answered from now on."""
         return self._answers.gather(key_expr)
 
     async def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
-        """Query ``key_expr`` and collect the replies of ``timeout_s`` seconds, bounded in number."""
         replies = await self._collect(
             key_expr,
             lambda handler: self._session.get(
@@ -214,23 +191,19 @@ class ZenohBus:
         return [read_reply(reply) for reply in replies]
 
     def attend(self) -> None:
-        """Serve the stops and the holder's commands that wait. Call it in the middle of long work."""
         for inbox in self._inboxes:
             inbox.attend()
 
     def announce(self, key: str) -> Handle:
-        """Declare a liveliness token."""
         return self._keep(Declared(self._session.liveliness().declare_token(key)))
 
     async def alive(self, key_expr: str, *, timeout_s: float = 0.5) -> list[str]:
-        """List the liveliness tokens that exist."""
         replies = await self._collect(
             key_expr, lambda handler: self._session.liveliness().get(key_expr, handler, timeout=timeout_s), timeout_s
         )
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 
     def watch_alive(self, key_expr: str, handler: Callable[[str, bool], None]) -> Handle:
-        """Call ``handler`` with every liveliness token that exists or appears (True) or disappears (False)."""
         return self._keep(self._alive.add(key_expr, handler))
 
     def _declare_alive(self, key_expr: str, handler: Changed) -> Handle:
@@ -269,11 +242,6 @@ class ZenohBus:
     def frames(
         self, key: str, listened: Callable[[bool], None], *, best_effort: bool = False, kept: int = 0
     ) -> Publisher:
-        """Declare a key for raw frames; call ``listened`` when the first listener appears and the last one leaves.
-
-        best_effort: links may lose frames. kept: last frames that late advanced subscribers of Zenoh get; needs a bus
-        with timestamps.
-        """
 
         def changed(matching: bool) -> None:
             self._loop.call_soon_threadsafe(listened, matching)
@@ -285,11 +253,9 @@ class ZenohBus:
         )
 
     def watch_listeners(self, key: str, handler: Callable[[bool], None]) -> Handle:
-        """Call ``handler`` when the first listener of ``key`` appears (True) and when the last one leaves (False)."""
         return self.frames(key, handler)
 
     def watch_connected(self, handler: Callable[[bool], None]) -> Handle:
-        """Call ``handler`` when the first connection to the bus is made (True) and the last one is lost (False)."""
         return self._keep(ConnectedWatch(self._session.info, self._loop, handler))
 
     async def close(self) -> bool:

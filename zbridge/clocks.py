@@ -1,0 +1,24 @@
+"""Clocks of this machine that Python has no function for."""
+
+from __future__ import annotations
+
+import time
+
+_RAW = getattr(time, "CLOCK_MONOTONIC_RAW", time.CLOCK_MONOTONIC)
+_BOOT = getattr(time, "CLOCK_BOOTTIME", None)
+
+
+def raw_ms() -> float:
+    """Return milliseconds of CLOCK_MONOTONIC_RAW, which no time service slews; from any thread."""
+    return time.clock_gettime_ns(_RAW) / 1e6
+
+
+def suspended_s() -> float:
+    """Return for how many seconds this machine was suspended since it was booted; 0 where the platform does not say.
+
+    The result may be too small by the time between two readings, never too large.
+    """
+    if _BOOT is None:
+        return 0.0
+    since_boot = time.clock_gettime(_BOOT)
+    return since_boot - time.monotonic()

@@ -20,7 +20,6 @@ SHARED = {"Device", "Odometry", "Reading", "Session"}
 WHITE_BOX = ("tests/search/", "tests/simulated/", "tests/e2e/rigs/", "tests/e2e/measured/", "tests/benchmarks/")
 """These copy and name whole states of machines, or have private attributes of their own."""
 LONGER = {
-    "zbridge/control/authority.py",  # one state machine and its table
     "zbridge/robot/device.py",
     "zbridge/robot/ownership.py",  # one state machine and its table
     "zbridge/transport/conversation.py",

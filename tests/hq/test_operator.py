@@ -408,7 +408,7 @@ async def test_mode_autonomous_keeps_the_lease_while_anything_is_heard(scene: Sc
 
 
 async def test_a_lease_shorter_than_usual_is_given_back_sooner(scene: Scene) -> None:
-    scene.authority.lease_s = 1.0
+    scene.authority.machine.lease_s = 1.0
     await scene.play(f"{DRIVES}; tick 7; held True; tick; held False")
 
 

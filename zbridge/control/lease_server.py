@@ -54,7 +54,7 @@ class LeaseServer:
             "refused": NameFilter(clock),
         }
         for command, admission in self._filters.items():
-            enforcer.watch_refusals(command, admission.refusals)
+            enforcer.refusal_limits[command] = admission.refusals
         self._closing: str | None = None
         self._waits: str | None = None
         """Why no lease is granted yet."""

@@ -101,7 +101,7 @@ class Standstill:
             self._conditions.set(_CONDITION, None)
         elif (
             (self._idle_stop_s or self._authority.latches)
-            and not self._authority.driven
+            and not self._authority.motion.driven
             and now >= self._repeated_until
         ):
             try:

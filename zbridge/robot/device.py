@@ -227,7 +227,8 @@ class Device(Transferable):
     @property
     def driven(self) -> bool:
         """Whether a program drives the robot, or told it to move by itself."""
-        return self._enforcer.authority.driven or self._enforcer.authority.moving
+        motion = self._enforcer.authority.motion
+        return motion.driven or motion.moving
 
     @property
     def state(self) -> str:
@@ -265,7 +266,7 @@ class Device(Transferable):
 
     def refuse(self, command: str, refusal: Refused, who: str) -> None:
         """Show on ``control`` what was refused to somebody."""
-        self._enforcer.refuse(command, refusal, who)
+        self._enforcer.authority.refuse(command, refusal, who)
         self._enforcer.settle()
 
     def _session(self, link: str, address: str) -> Session[Any]:
@@ -465,7 +466,7 @@ class Device(Transferable):
         self._presence.leave()
         self._commands.refuse_all(_LEAVING)
         self._leases.refuse_all(_LEAVING)
-        if self._enforcer.authority.moving:
+        if self._enforcer.authority.motion.moving:
             self._enforcer.stop(_LEAVING)
         await asyncio.sleep(min(self._standstill.stopping_s, STOP_REPEAT_S))
         await asyncio.gather(*(connection.close(_LEAVING, LEAVE_S) for connection in self._links))

@@ -21,7 +21,6 @@ WHITE_BOX = ("tests/search/", "tests/simulated/", "tests/e2e/rigs/", "tests/e2e/
 """These copy and name whole states of machines, or have private attributes of their own."""
 LONGER = {
     "zbridge/robot/device.py",
-    "zbridge/robot/ownership.py",  # one state machine and its table
     "zbridge/transport/conversation.py",
 }
 """Files that are longer, or have a longer function."""

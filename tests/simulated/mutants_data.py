@@ -24,6 +24,7 @@ LATCH = "zbridge/control/latch.py"
 INTENT = "zbridge/hq/intent.py"
 STICK = "zbridge/lease/stick.py"
 OWNERSHIP = "zbridge/robot/ownership.py"
+CLAIM_BUS = "zbridge/robot/claim_bus.py"
 CLAIM = "zbridge/robot/claim.py"
 COMMANDS = "zbridge/robot/commands.py"
 DEVICE = "zbridge/robot/device.py"
@@ -258,7 +259,7 @@ MUTANTS = (
     Mutant(
         "ownership never yields (split brain)",
         "ownership",
-        OWNERSHIP,
+        CLAIM_BUS,
         "        return any(claim.better_than(own, zid, self._bus.zid) for zid, claim in claims.items())",
         "        return False",
     ),
@@ -272,7 +273,7 @@ MUTANTS = (
     Mutant(
         "a claim is not announced",
         "ownership",
-        OWNERSHIP,
+        CLAIM_BUS,
         "question.answer(write(self._claim()))",
         "question.answer(write(Claim()))",
     ),
@@ -280,7 +281,7 @@ MUTANTS = (
         "nobody looks before taking",
         "ownership",
         OWNERSHIP,
-        "if self._bus_gone or await self._sees(others):",
+        "if self._bus.gone or await self._sees(others):",
         "if False:",
     ),
     Mutant(

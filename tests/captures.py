@@ -1,6 +1,6 @@
 """Reader of the recorded sessions in ``tests/vectors``.
 
-Each ``.hex`` file there is one session between two deployed programs. A line is one TCP segment or one datagram:
+Each ``.hex`` file there is one session between two legacy programs. A line is one TCP segment or one datagram:
 seconds since the first packet, transport, ``source port->destination port``, then either a payload length and the
 payload in hex, or the name of a connection event (``SYN``, ``SYN+ACK``, ``FIN``).
 """

@@ -13,7 +13,7 @@ ZbridgeError
 │   ├── NotReady     ... because the robot or its gateway accepts none now           not_ready, busy, closing
 │   ├── Unsupported  ... because this robot cannot do it                             unsupported
 │   ├── Malformed    ... because it cannot be read, or its number is out of order    malformed, out_of_order
-│   └── TooFast      ... because commands come faster than allowed                   rate
+│   └── RateLimited      ... because commands come faster than allowed                   rate
 ├── LinkError        an address is not valid, or a connection cannot be made
 ├── BusError         the bus cannot be opened, or a query has no answer
 ├── HandoverError    a restarted gateway cannot take over what the one before it hands over
@@ -145,7 +145,7 @@ class Malformed(Refused):
     codes = (Code.MALFORMED, Code.OUT_OF_ORDER)
 
 
-class TooFast(Refused):
+class RateLimited(Refused):
     """Commands come faster than allowed."""
 
     codes = (Code.RATE,)

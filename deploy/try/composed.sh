@@ -7,7 +7,7 @@ ip link set lo up
 # crun supports control groups of version 1 or 2, not both at once.
 ! mountpoint --quiet /sys/fs/cgroup/unified || umount /sys/fs/cgroup/unified
 compose() { podman-compose --file "$root/deploy/container/compose.yaml" "$@" >"$work/compose.log" 2>&1; }
-robot='' # the fragile robot serves one connection per start, as deployed ones do: robot() restarts it
+robot='' # the fragile robot serves one connection per start, as legacy ones do: robot() restarts it
 robot() {
     [ -z "$robot" ] || { kill "$robot" 2>/dev/null || true; wait "$robot" 2>/dev/null || true; }
     [ "${1:-}" = gone ] || { "$work/tools/bin/python" "$root/deploy/try/robot.py" 11001 r1.account >robot.log 2>&1 & robot=$!; }

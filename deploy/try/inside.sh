@@ -18,7 +18,7 @@ over() {
 declare -A robots=()
 trap 'over $?' EXIT
 
-robot() { # NAME PORT: restarts a fragile robot, which serves one connection per start, as deployed ones do
+robot() { # NAME PORT: restarts a fragile robot, which serves one connection per start, as legacy ones do
     start_of "$1" /opt/zbridge/bin/python "$root/deploy/try/robot.py" "$2" "$work/$1.account"
 }
 start_of() { # NAME COMMAND...: starts a command; not a function, which would run in a process of its own

@@ -1,4 +1,4 @@
-"""A robot as fragile as deployed ones, with a record of its commands: one connection per start, no fault tolerated.
+"""A robot as fragile as legacy ones, with a record of its commands: one connection per start, no fault tolerated.
 
 Usage: robot.py PORT ACCOUNT. Each line of the file ACCOUNT is a time (monotonic seconds) and the commanded speed, or a
 word and what happened: ``event: second connection ...``, ``violation: ...``.

@@ -2,7 +2,7 @@
 
 ``messages`` declares the five messages for both dialects; ``session`` holds the conversation in both roles;
 ``translate`` is the device side, ``hq`` the HQ side. ``simulator`` is a simulated vehicle; ``conformance`` has peers as
-fragile as deployed ones, which share no code with the rest.
+fragile as legacy ones, which share no code with the rest.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ connect = ["tcp://127.0.0.1:6666"]      # the vehicle; or its drive server, then
 [device.options]
 dialect = "text"                        # what vehicles in the field speak; "binary": the document's packed fields
 points = 769                            # points of a measurement; binary framing depends on it
-points_from_scanner = false             # reckon them from scanner init instead (the deployed scanner's is wrong)
+points_from_scanner = false             # reckon them from scanner init instead (the legacy scanner's is wrong)
 speed_full = 100                        # the speed that is full scale
 # acceleration_m_s2 = 9.80665           # one unit of acceleration; left out: 1 g in text, 0.001 g in binary
 # gyro_rad_s = 0.017453292519943295     # one unit of gyro; left out: 1 degree/s in text, 0.1 in binary
@@ -34,7 +34,7 @@ listen = "tcp://127.0.0.1:6667"
 [hq.options]
 dialect = "text"                        # what programs in the field speak; "binary": the document's packed fields
 serve = "auto"                          # 1 and 2 until a client sends its first 3, from then on 4 and no 1; or always
-                                        # "drive", "laser", "both": no deployed program tolerates both
+                                        # "drive", "laser", "both": no legacy program tolerates both
 points = 769                            # points of a measurement; scans of another number are resampled by angle
 # acceleration_m_s2 = 9.80665           # one unit of acceleration; left out: 1 g in text, 0.001 g in binary
 # gyro_rad_s = 0.017453292519943295     # one unit of gyro; left out: 1 degree/s in text, 0.1 in binary

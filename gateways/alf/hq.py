@@ -23,9 +23,9 @@ from zbridge.fleet.view import RobotView
 from zbridge.protocol import EncodeError, Exported, HqSide, Limits, Metrics, ProtocolError, Send, Telemetry
 
 DEADMAN_S = 0.3
-"""Deployed HQ programs repeat their command every 20 ms."""
+"""Legacy HQ programs repeat their command every 20 ms."""
 COUNTER_ENDS = 2**31
-"""One more than the largest integer that deployed receivers can read."""
+"""One more than the largest integer that legacy receivers can read."""
 FULL_INFO = 100
 """The speed of drive info at full scale."""
 _FULL_SPEED = {messages.AlfDialect.TEXT: 255, messages.AlfDialect.BINARY: 100}
@@ -221,7 +221,7 @@ class AlfHq(HqSide):
         if not self._drive:
             session.left_out["drive command"] += 1
             return ()
-        if self._auto and not session.drive:  # no deployed program can read both kinds ("The gateway as vehicle")
+        if self._auto and not session.drive:  # no legacy program can read both kinds ("The gateway as vehicle")
             session.show_drive()
         straight = FULL_LOCK_DEG if self._dialect is messages.AlfDialect.BINARY else 0
         right = max(-1.0, min(1.0, (message.steering - straight) / FULL_LOCK_DEG))

@@ -33,14 +33,14 @@ from zbridge.wire import (
 from zbridge.wire.frames import FrameEnd
 
 POINTS = 769
-"""Points of a measurement of the deployed scanner."""
+"""Points of a measurement of the legacy scanner."""
 MOST_POINTS = 10_000
 _MOST_MEASURED = 1e9
 POINT_BYTES = 8
 
 
 class AlfDialect(Enum):
-    """The packed fields of the document, or the ASCII of deployed programs."""
+    """The packed fields of the document, or the ASCII of legacy programs."""
 
     BINARY = "binary"
     TEXT = "text"

@@ -2,7 +2,7 @@
 
 ``messages`` declares the packets, ``settings`` the settings blocks and versions; ``session`` holds the conversation in
 both roles; ``translate`` and ``telemetry`` are the device side, ``hq``, ``hq_client`` and ``maps`` the HQ side,
-``options`` the options of both. ``simulator`` is a simulated robot; ``conformance`` has peers as fragile as deployed
+``options`` the options of both. ``simulator`` is a simulated robot; ``conformance`` has peers as fragile as legacy
 ones, which share no code with the rest.
 """
 
@@ -83,7 +83,7 @@ async def _simulate_hq(simulation: HqSimulation) -> None:
         raise ConfigError("TCP/UDP HQ programs have no dialects")
     if version not in HQ_BLOCKS:
         raise ConfigError(f"version {version!r}: expected one of {', '.join(HQ_BLOCKS)}")
-    udp = simulation.udp or version == "1.3"  # deployed programs of 1.3 drive by nothing else
+    udp = simulation.udp or version == "1.3"  # legacy programs of 1.3 drive by nothing else
     await FragileTcpUdpHq(version=version, udp=udp).simulate(address.host, address.port, simulation.drive)
 
 

@@ -38,7 +38,7 @@ from zbridge.fleet.view import RobotView
 from zbridge.protocol import ClientIds, Datagram, EncodeError, HqSide, Limits, Metrics, Send, Telemetry, newest
 
 DEADMAN_S = 1.3
-"""Deployed HQ programs repeat the position of their stick every 0.5 s."""
+"""Legacy HQ programs repeat the position of their stick every 0.5 s."""
 CLIENTS = range(2, 256)
 """Client ids; 1 is the server's."""
 

@@ -90,7 +90,7 @@ _MAPPING = (Feature.SLAM_MAP, Feature.LIDAR)
 
 @packet(1, "debugMessage", PacketSender.BOTH)
 class DebugMessage(Packet, frozen=True):
-    """A text for people; an empty one crashes deployed robots."""
+    """A text for people; an empty one crashes legacy robots."""
 
     text: Text
 

@@ -104,7 +104,7 @@ def read_settings(versions: str, block: bytes, blocks: dict[str, type[Settings]]
 
 
 LISTED = ("1.1", "1.2", "1.3")
-"""What peers of version 1.3 list; with other lists deployed robots of 1.3 and "1.4" may crash."""
+"""What peers of version 1.3 list; with other lists legacy robots of 1.3 and "1.4" may crash."""
 _LISTED = ",".join(LISTED)
 
 
@@ -131,7 +131,7 @@ VERSIONS = {
 
 
 ANNOUNCED = (Feature.UDP, Feature.LIDAR_SIM)
-"""What deployed HQ programs announce."""
+"""What legacy HQ programs announce."""
 
 
 def announced(listed: str, features: Collection[Feature]) -> bytes:

@@ -29,7 +29,7 @@ SPEED_M_S = 0.5
 TURN_RAD_S = 1.0
 """Rate of turn at packet speed 1."""
 SILENCE_S = 1.0
-"""Deployed simulators stop by themselves after so long without 11, 12 or 13."""
+"""Legacy simulators stop by themselves after so long without 11, 12 or 13."""
 UNIT_M = 0.01
 CELL = 10
 """Side of a map cell in the robot's unit."""
@@ -42,7 +42,7 @@ CLIENTS = range(2, 256)
 QUIET_S = 2.0
 """Seconds before a client id is given again ("The gateway as robot")."""
 PARTS = 4
-"""Packets in which a robot of version "1.4" sends its map, one a second, again and again; deployed ones make 4096."""
+"""Packets in which a robot of version "1.4" sends its map, one a second, again and again; legacy ones make 4096."""
 
 
 def settings_of(version: str, *, udp: bool) -> Settings:
@@ -164,7 +164,7 @@ class RobotSimulator(Simulator[packets.Packet]):
         self._ids.release(client.session.client_id, self._loop.time())
 
     def check(self, session: Session[packets.Packet], message: packets.Packet) -> None:
-        """Refuse what the HQ does not know; deployed robots send parts of the map without that check."""
+        """Refuse what the HQ does not know; legacy robots send parts of the map without that check."""
         assert isinstance(session, RobotRole)
         if not isinstance(message, packets.ServerSLAMMapPart):
             session.may_send(message)
@@ -193,7 +193,7 @@ class RobotSimulator(Simulator[packets.Packet]):
             self.tell(packets.ServerLidarStatus(1))
 
     def _send_part(self, number: int) -> None:
-        """Send a part of the map to every HQ that announced LidarSim, as deployed robots do."""
+        """Send a part of the map to every HQ that announced LidarSim, as legacy robots do."""
         cells = self.vehicle.grid.cells.tobytes()
         size = -(-len(cells) // PARTS)
         start = number % PARTS * size

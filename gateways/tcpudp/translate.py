@@ -287,7 +287,7 @@ _COMMANDS: dict[str, Callable[[TcpUdpRobot, Any, float], Outcome | None]] = {
 
 
 SCAN_POINTS = 360
-"""Points deployed robots take in simulated lidar data, one a degree."""
+"""Points legacy robots take in simulated lidar data, one a degree."""
 
 
 def polar_ranges(scan: Scan, unit_m: float) -> np.ndarray[Any, np.dtype[np.float32]]:

@@ -2,7 +2,7 @@
 
 ``messages`` declares the messages of both dialects; ``session`` holds the conversation in both roles; ``devices`` and
 ``translate`` are the device side, ``hq``, ``hq_client`` and ``device_table`` the HQ side, ``options`` the options of
-both. ``simulator`` is a simulated robot; ``conformance`` has peers as fragile as deployed ones, which share no code
+both. ``simulator`` is a simulated robot; ``conformance`` has peers as fragile as legacy ones, which share no code
 with the rest.
 """
 
@@ -23,7 +23,7 @@ connect = ["tcp://127.0.0.1:27015"]     # the Webots controller: one port per ro
 dialect = "deployed"                    # what programs in the field speak; "draft": the document's, without names
 motor_types = { rotational = [53], linear = [46] }  # type bytes that are motors; they move with the Webots version
 # motors = { rotational = ["wheel1"], linear = [] }  # names that are motors, whatever their type byte
-# bounds_default = [0.0, 1000.0]        # readings outside are faults; these bounds are the deployed application's
+# bounds_default = [0.0, 1000.0]        # readings outside are faults; these bounds are the legacy application's
 # bounds = { front = [-1.0, 5000.0] }   # others for some sensors
 # tables = { front = [[0.0, 1.0], [1000.0, 0.02]] }  # from a sensor's value to metres (or irradiance), interpolated
 # bearings_deg = { front = 0.0, left = 90.0 }  # directions of distance sensors, counter-clockwise: they make a scan

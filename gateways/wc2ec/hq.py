@@ -105,7 +105,7 @@ class Wc2EcHq(HqSide):
 
 
 FAULT = -1.0
-"""What a distance sensor shows when nothing is known: deployed controllers take it as a fault, while anything from
+"""What a distance sensor shows when nothing is known: legacy controllers take it as a fault, while anything from
 0 to 1000 would be a false distance ("The gateway as Webots controller")."""
 
 

@@ -1,6 +1,6 @@
 """One external controller: its session, and its messages as fleet commands. Sans-IO.
 
-A robot without motors is shown two, ``left`` and ``right``. Deployed controllers set them one after the other: what is
+A robot without motors is shown two, ``left`` and ``right``. Legacy controllers set them one after the other: what is
 set within ``join_s`` becomes one drive; a stop never waits. Source: "The gateway as Webots controller".
 """
 

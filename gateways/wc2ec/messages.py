@@ -25,7 +25,7 @@ _QUOTED = 16
 
 
 class Wc2EcDialect(Enum):
-    """The document's first draft, or the dialect of deployed programs."""
+    """The document's first draft, or the dialect of legacy programs."""
 
     DRAFT = "draft"
     DEPLOYED = "deployed"
@@ -97,7 +97,7 @@ class SensorData(Wc2EcMessage, frozen=True):
 
 @message("error", deployed=127)
 class Error(Wc2EcMessage, frozen=True):
-    """Documented, but sent by no deployed program."""
+    """Documented, but sent by no legacy program."""
 
 
 @message("enableSensor", draft=128)

@@ -78,6 +78,7 @@ async def test_a_crowd_of_silent_clients_keeps_nobody_waiting_and_is_closed_from
 ) -> None:
     """Nobody's time is over: only room that is made lets the last one in."""
     monkeypatch.setattr(exporter, "REQUEST_S", 60.0)
+    monkeypatch.setattr(exporter, "PAUSE_S", 0.0)  # else the kernel's queue fills, and it drops connections
     loop = asyncio.get_running_loop()
     async with serve_metrics(address, metrics):
         silent = list[socket.socket]()

@@ -65,7 +65,7 @@ class Driver:
         return {"first_seq": first_seq, "sent_ns": sent_ns}
 
     def renew(self, count: int) -> list[float]:
-        """Ask for the lease to go on, one question after the other; microseconds to each answer."""
+        """Ask for the lease to continue, one question after the other; microseconds to each answer."""
         held = self._authorize() if self._leased else Holder(bytes(8), bytes(32), ROBOT)
         questions = [held.question("renew") for _ in range(count)]
         return [self._question("renew", payload)[0] for payload in questions]

@@ -52,7 +52,7 @@ WHAT = {
 ATTEMPTS = 3
 """Times a run that fails is begun."""
 _MORE = {"alf": 'options = { serve = "both" }\n'}
-"""Clients of ALF take all there is here, which no deployed program does."""
+"""Clients of ALF take all there is here, which no legacy program does."""
 _ALL_AT_ONCE = "accept_hz = 10000\n"
 _PACKAGE = "tests.benchmarks"
 _ROWS = 24
@@ -254,7 +254,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="one pair of short runs, with 1 and 250 clients")
     parser.add_argument("--profile", action="store_true", help="only profile the listener with most clients")
-    parser.add_argument("--talk", action="store_true", help="clients repeat their neutral command as deployed ones do")
+    parser.add_argument("--talk", action="store_true", help="clients repeat their neutral command as legacy ones do")
     parser.add_argument("--kinds", default=",".join(KINDS), help="of clients")
     parser.add_argument("--clients", help="how many, separated by commas")
     parser.add_argument("--pairs", type=int, help="runs of each, in turn")

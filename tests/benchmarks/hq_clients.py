@@ -1,7 +1,7 @@
 """The HQ programs of the benchmark: many sockets on one epoll that store when which message came, and nothing else.
 
 ``python -m tests.benchmarks.hq_clients KIND PORT COUNT [talk]``. TCP/UDP clients are of version 1.3 and shake hands,
-``udp`` with datagrams; ALF clients speak text. ``talk``: repeat neutral as deployed programs do, packet 13 every half
+``udp`` with datagrams; ALF clients speak text. ``talk``: repeat neutral as legacy programs do, packet 13 every half
 second or a drive command every 20 ms. Told ``await TOTAL QUIET_S TIMEOUT_S``, it reports what came of each client.
 """
 

@@ -7,7 +7,7 @@ runs at nearly full speed, unlike under a tracing profiler.
 
 A sample taken at the very beginning of a function goes to its caller: the interpreter looks for signals there and
 after calls of C code, so the time was spent before. Other Python threads are charged their own CPU time at the
-place where they let the main thread go on: their sums are right, their places approximate. SIGUSR1 begins anew.
+place where they let the main thread continue: their sums are right, their places approximate. SIGUSR1 begins anew.
 """
 
 from __future__ import annotations

@@ -169,7 +169,7 @@ class Scene:
         return tuple(self._ask(self._driver, f"renew {count}")["took_us"][WARM:])
 
     def flood(self, count: int, flood_hz: float, drive_hz: float, calm_s: float) -> Flood:
-        """Drive in peace, then go on while another process sends what nobody may."""
+        """Drive in peace, then continue while another process sends what nobody may."""
         adversary = self._start(f"{_PACKAGE}.adversary", self._endpoint)
         adversary.hear()
         lease = self._ask(self._driver, "lease")

@@ -25,7 +25,7 @@ from zbridge.transport.tcp import TcpLink
 
 STAGES = {
     "callback": "Zenoh called back",
-    "proven": "proof checked, lane chosen",
+    "proven": "proof checked, priority chosen",
     "woken": "event loop woken",
     "taken": "sample read",
     "admitted": "lease checked",

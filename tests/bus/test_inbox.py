@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from zbridge.bus import Lane
+from zbridge.bus import PriorityClass
 from zbridge.bus.inbox import QUEUE, QUEUE_BYTES, SHARES, Inbox, Source
 from zbridge.metrics import Metrics
 
@@ -23,9 +23,9 @@ class Rig:
     def another_source(self) -> Source:
         return self.inbox.source(self.seen.append, lambda value: value)
 
-    def put(self, raws: Iterable[Any], lane: Lane = Lane.OTHER, size: int = 0) -> None:
+    def put(self, raws: Iterable[Any], priority: PriorityClass = PriorityClass.OTHER, size: int = 0) -> None:
         for raw in raws:
-            self.source.put(raw, lane, size)
+            self.source.put(raw, priority, size)
 
     async def drained(self) -> list[Any]:
         for _ in range(100):
@@ -41,20 +41,27 @@ async def rig() -> Rig:
 async def test_items_come_in_order_and_are_read_on_the_loops_thread_only(rig: Rig) -> None:
     readers = list[int]()
     source = rig.inbox.source(rig.seen.append, lambda raw: readers.append(threading.get_ident()) or raw)
-    await asyncio.to_thread(lambda: [source.put(number, Lane.OTHER) for number in range(3000)])
+    await asyncio.to_thread(lambda: [source.put(number, PriorityClass.OTHER) for number in range(3000)])
     assert await rig.drained() == list(range(3000))
     assert set(readers) == {threading.get_ident()}
     rig.put([1])
     assert len(rig.seen) == 3000, "and not before the loop runs"
 
 
-async def test_the_lanes_are_served_in_their_order_and_attending_serves_stops_and_commands_at_once(rig: Rig) -> None:
-    for lane in (Lane.OTHER, Lane.COMMAND, Lane.STOP, Lane.COMMAND, Lane.STOP, Lane.OTHER):
-        rig.put([lane], lane)
+async def test_input_is_served_by_priority_and_attending_serves_stops_and_commands_at_once(rig: Rig) -> None:
+    for priority in (
+        PriorityClass.OTHER,
+        PriorityClass.COMMAND,
+        PriorityClass.STOP,
+        PriorityClass.COMMAND,
+        PriorityClass.STOP,
+        PriorityClass.OTHER,
+    ):
+        rig.put([priority], priority)
     rig.inbox.attend()
     rig.inbox.attend()
-    assert rig.seen == [Lane.STOP, Lane.STOP, Lane.COMMAND, Lane.COMMAND]
-    assert (await rig.drained())[4:] == [Lane.OTHER, Lane.OTHER]
+    assert rig.seen == [PriorityClass.STOP, PriorityClass.STOP, PriorityClass.COMMAND, PriorityClass.COMMAND]
+    assert (await rig.drained())[4:] == [PriorityClass.OTHER, PriorityClass.OTHER]
 
 
 async def test_a_command_that_comes_late_goes_before_the_rest_of_a_long_queue(rig: Rig) -> None:
@@ -62,23 +69,25 @@ async def test_a_command_that_comes_late_goes_before_the_rest_of_a_long_queue(ri
     await asyncio.sleep(0)
     before = len(rig.seen)
     assert 0 < before < 1000, "the loop must get its turn between batches"
-    rig.put(["command"], Lane.COMMAND)
+    rig.put(["command"], PriorityClass.COMMAND)
     assert await rig.drained() == [*range(before), "command", *range(before, 1000)]
 
 
 async def test_what_the_holder_says_keeps_its_order_whatever_it_comes_by(rig: Rig) -> None:
     """A release that overtook the neutral before it would have it refused."""
-    rig.put(range(3), Lane.COMMAND)
-    rig.another_source().put("release", Lane.COMMAND)
-    rig.put(["acquired anew"], Lane.COMMAND)
+    rig.put(range(3), PriorityClass.COMMAND)
+    rig.another_source().put("release", PriorityClass.COMMAND)
+    rig.put(["acquired anew"], PriorityClass.COMMAND)
     assert await rig.drained() == [0, 1, 2, "release", "acquired anew"]
 
 
 # Floods
 
 
-@pytest.mark.parametrize(("flood", "other"), [(Lane.OTHER, Lane.COMMAND), (Lane.COMMAND, Lane.STOP)])
-async def test_a_full_lane_forgets_its_oldest_item_counts_it_and_costs_no_lane_before_it(rig, flood, other) -> None:
+@pytest.mark.parametrize(
+    ("flood", "other"), [(PriorityClass.OTHER, PriorityClass.COMMAND), (PriorityClass.COMMAND, PriorityClass.STOP)]
+)
+async def test_a_full_queue_drops_its_oldest_item_counts_it_and_costs_no_higher_priority(rig, flood, other) -> None:
     rig.put(["first"], other)
     rig.put(range(QUEUE + 3), flood)
     assert rig.metrics.total("bus_in_dropped") == 3
@@ -87,13 +96,13 @@ async def test_a_full_lane_forgets_its_oldest_item_counts_it_and_costs_no_lane_b
 
 async def test_a_flood_of_commands_leaves_the_others_their_share(rig: Rig) -> None:
     rig.put(["other"])
-    rig.put(range(QUEUE), Lane.COMMAND)
-    assert (await rig.drained()).index("other") == SHARES[Lane.COMMAND]
+    rig.put(range(QUEUE), PriorityClass.COMMAND)
+    assert (await rig.drained()).index("other") == SHARES[PriorityClass.COMMAND]
 
 
 async def test_a_flood_of_one_source_costs_no_item_of_another_and_no_more_than_its_turn(rig: Rig) -> None:
     rig.put(["noise"] * 2 * QUEUE)
-    rig.another_source().put("question", Lane.OTHER)
+    rig.another_source().put("question", PriorityClass.OTHER)
     await asyncio.sleep(0)
     assert "question" in rig.seen[:2]
 
@@ -109,7 +118,7 @@ async def test_what_waits_has_a_bound_in_bytes_too(rig: Rig) -> None:
 async def test_items_of_many_threads_arrive_all_whatever_the_loop_does_meanwhile(rig: Rig) -> None:
     def bring(source: Source, first: int) -> None:
         for number in range(first, first + 3000):
-            source.put(number, Lane(number % len(Lane)))
+            source.put(number, PriorityClass(number % len(PriorityClass)))
 
     sources = [rig.another_source() for _ in range(4)]
     await asyncio.gather(*(asyncio.to_thread(bring, source, 3000 * i) for i, source in enumerate(sources)))
@@ -123,18 +132,18 @@ async def test_items_of_many_threads_arrive_all_whatever_the_loop_does_meanwhile
 
 async def test_a_stop_that_waits_makes_the_next_ones_of_its_robot_count_only(rig: Rig) -> None:
     for number in range(1000):
-        rig.source.fold(number, Lane.STOP)
-    rig.another_source().fold("another robot's", Lane.STOP)
+        rig.source.fold(number, PriorityClass.STOP)
+    rig.another_source().fold("another robot's", PriorityClass.STOP)
     assert await rig.drained() == [0, "another robot's"]
     assert rig.metrics.total("bus_in_folded") == 999
 
     def stop(number: int) -> None:
         rig.seen.append(number)
         if number < 3:
-            source.fold(number + 1, Lane.STOP)
+            source.fold(number + 1, PriorityClass.STOP)
 
     source = rig.inbox.source(stop)
-    source.fold(1, Lane.STOP)
+    source.fold(1, PriorityClass.STOP)
     assert (await rig.drained())[2:] == [1, 2, 3], "one that comes while one is carried out is carried out after it"
 
 
@@ -142,7 +151,7 @@ async def test_a_stop_that_waits_makes_the_next_ones_of_its_robot_count_only(rig
 
 
 async def test_a_handler_that_fails_is_logged_and_the_next_item_comes(rig: Rig, caplog) -> None:
-    rig.inbox.source(lambda value: 1 / value).put(0, Lane.OTHER)
+    rig.inbox.source(lambda value: 1 / value).put(0, PriorityClass.OTHER)
     rig.put([2])
     with caplog.at_level(logging.ERROR):
         assert await rig.drained() == [2]

@@ -39,7 +39,7 @@ class Rig:
         self._go.set()
 
     def end(self) -> None:
-        """Let the thread go on, and wait until it has written everything."""
+        """Let the thread continue, and wait until it has written everything."""
         self.release()
         self.writer.stop(SOON_S)
 

@@ -16,7 +16,7 @@ import zenoh
 
 from tests.bus import SOON_S, Seen
 from tests.ports import free_port
-from zbridge.bus import BusSettings, Lane, Look
+from zbridge.bus import BusSettings, PriorityClass, ReadPayload
 from zbridge.bus.zenoh import ZenohBus, declared, incoming, open_zenoh, publishers, session, zenoh_config
 from zbridge.errors import BusError, Code, Held, Refused, Unsupported
 from zbridge.fleet import topics
@@ -33,17 +33,19 @@ async def bus() -> AsyncIterator[ZenohBus]:
     await opened.close()
 
 
-async def test_the_lane_of_a_sample_is_chosen_by_its_attachment_and_what_a_sort_drops_never_comes(bus) -> None:
+async def test_the_priority_of_a_sample_is_chosen_by_its_attachment_and_what_a_sort_drops_never_comes(bus) -> None:
     seen, sorted_out = Seen(), list[tuple[str, bytes | None, int, bytes]]()
     all_sorted = threading.Event()
 
-    def lane(key: str, attachment: bytes | None, size: int, look: Look) -> Lane | None:
-        sorted_out.append((key, attachment, size, look()))
+    def priority(key: str, attachment: bytes | None, size: int, read_payload: ReadPayload) -> PriorityClass | None:
+        sorted_out.append((key, attachment, size, read_payload()))
         if len(sorted_out) == len(sent):
             all_sorted.set()
-        return None if attachment == b"bad" else Lane.COMMAND if attachment == b"holder" else Lane.OTHER
+        return (
+            None if attachment == b"bad" else PriorityClass.COMMAND if attachment == b"holder" else PriorityClass.OTHER
+        )
 
-    bus.subscribe("fleet/r1/@cmd/**", lambda sample: seen.take(sample.payload, sample.attachment), lane=lane)
+    bus.subscribe("fleet/r1/@cmd/**", lambda sample: seen.take(sample.payload, sample.attachment), priority=priority)
     drive = bus.publisher("fleet/r1/@cmd/drive", topics.CMD_DRIVE)
     sent = [(b"1", None), (b"2", b"other"), (b"3", b"holder"), (b"4", b"bad"), (b"5", b"holder"), (b"6", b"last")]
     for payload, attachment in sent:
@@ -54,14 +56,14 @@ async def test_the_lane_of_a_sample_is_chosen_by_its_attachment_and_what_a_sort_
     assert seen == [sent[2], sent[4], sent[0], sent[1], sent[5]]
 
 
-async def test_the_lane_of_a_question_is_chosen_by_its_payload_and_what_a_sort_drops_is_not_answered(bus) -> None:
+async def test_the_priority_of_a_question_is_chosen_by_its_payload_and_what_a_sort_drops_is_not_answered(bus) -> None:
     chosen = list[tuple[str, bytes | None, int, bytes]]()
 
-    def lane(key: str, payload: bytes | None, size: int, look: Look) -> Lane | None:
-        chosen.append((key, payload, size, look()))
-        return Lane.COMMAND if payload == b"proof" else None
+    def priority(key: str, payload: bytes | None, size: int, read_payload: ReadPayload) -> PriorityClass | None:
+        chosen.append((key, payload, size, read_payload()))
+        return PriorityClass.COMMAND if payload == b"proof" else None
 
-    bus.answer("fleet/r1/@rpc/control/renew", lambda question: question.answer(b"yes"), lane=lane)
+    bus.answer("fleet/r1/@rpc/control/renew", lambda question: question.answer(b"yes"), priority=priority)
     for key in ("fleet/r1/@rpc/control/renew", "fleet/*/@rpc/control/renew"):
         assert len(await bus.ask(key, b"proof")) == 1
         assert chosen[-1] == (key, b"proof", 5, b"")
@@ -255,11 +257,11 @@ async def test_what_is_too_large_for_its_key_is_dropped_before_anybody_is_called
     sender = await asyncio.to_thread(zenoh.open, zenoh_config(BusSettings(multicast=False, connect=where)))
     seen, called = Seen(), list[tuple[str, int]]()
 
-    def sort(key: str, shown: bytes | None, size: int, look: Look) -> Lane | None:
+    def sort(key: str, shown: bytes | None, size: int, read_payload: ReadPayload) -> PriorityClass | None:
         called.append((key, size))
-        return Lane.OTHER
+        return PriorityClass.OTHER
 
-    gateway.subscribe("fleet/r1/@cmd/**", lambda sample: seen.take(sample.key, len(sample.payload)), lane=sort)
+    gateway.subscribe("fleet/r1/@cmd/**", lambda sample: seen.take(sample.key, len(sample.payload)), priority=sort)
     gateway.answer("fleet/r1/@rpc/pose", lambda question: question.answer(b"yes"))
     gateway.answer(REPORT, lambda question: question.answer(b"yes"))
 
@@ -318,12 +320,14 @@ async def test_buses_that_share_a_session_close_alone_and_serve_each_others_comm
     seen, metrics = Seen(), Metrics()
     shares = [bus.share(metrics.labelled(robot=name)) for name in ("r1", "r2")]
     for name, share in zip(("r1", "r2"), shares, strict=True):
-        share.subscribe(f"fleet/{name}/@cmd/**", lambda sample: seen.take(sample.key), lane=lambda *_: Lane.COMMAND)
+        share.subscribe(
+            f"fleet/{name}/@cmd/**", lambda sample: seen.take(sample.key), priority=lambda *_: PriorityClass.COMMAND
+        )
     assert {share.zid for share in shares} == {bus.zid}
     bus.publisher("fleet/r2/@cmd/drive", topics.CMD_DRIVE).put(b"1")
     await seen.until(lambda: len(seen) == 1)
     waiting = shares[1]._inbox.source(lambda item: seen.take(item))
-    waiting.put("urgent", Lane.COMMAND)
+    waiting.put("urgent", PriorityClass.COMMAND)
     shares[0].attend()  # in the middle of long work for r1
     assert seen[-1] == "urgent"
     assert await shares[0].close()

@@ -1,4 +1,4 @@
-"""What cameras write: the answer of a deployed robot's ``/stream.mjpg``, and JPEGs as small as they can be.
+"""What cameras write: the answer of a legacy robot's ``/stream.mjpg``, and JPEGs as small as they can be.
 
 The answer has the form of the server of the Raspberry Pi's camera library, which serves this path at this port (its
 example "Web streaming"): no page of ours has a capture.
@@ -31,6 +31,6 @@ def jpeg(number: int = 0, size: int = 64, width: int = 640, height: int = 480) -
 
 
 def part(picture: bytes) -> bytes:
-    """Write a picture as a deployed robot does."""
+    """Write a picture as a legacy robot does."""
     length = str(len(picture)).encode()
     return b"--FRAME\r\nContent-Type: image/jpeg\r\nContent-Length: " + length + b"\r\n\r\n" + picture + CRLF

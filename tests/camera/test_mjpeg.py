@@ -1,4 +1,4 @@
-"""Pictures cut out of a camera's answer: as deployed robots write it, as other cameras do, and as none should."""
+"""Pictures cut out of a camera's answer: as legacy robots write it, as other cameras do, and as none should."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def head(content_type: bytes) -> bytes:
 MIXED = b"multipart/x-mixed-replace"
 IMAGE = b"Content-Type: image/jpeg\r\n"
 CAMERAS = {
-    "a deployed robot": PLAIN,
+    "a legacy robot": PLAIN,
     "no length": HEAD + b"".join(b"--FRAME\r\n" + IMAGE + b"\r\n" + each + b"\r\n" for each in (ONE, TWO, THREE))
     + b"--FRAME\r\n",
     "no length and bare line feeds": head(MIXED + b";boundary=x").replace(b"\r", b"")

@@ -10,7 +10,7 @@ import pytest
 
 from tests.client import World
 from zbridge.client.pilot import STALE_S, Pilot
-from zbridge.errors import LeaseLost, NeutralFirst, NotReady, TooFast, ZbridgeError
+from zbridge.errors import LeaseLost, NeutralFirst, NotReady, RateLimited, ZbridgeError
 from zbridge.fleet.messages import Drive, Mode
 from zbridge.lease.stick import Stick, StickRules
 
@@ -89,7 +89,7 @@ async def test_a_command_does_not_wait_for_long() -> None:
 
 async def test_a_command_that_waits_is_withdrawn_by_a_stop(scene: Scene) -> None:
     scene.pilot.drive(FIRST)
-    scene.pilot.hold_back("stop")
+    scene.pilot.require_neutral("stop")
     with pytest.raises(NeutralFirst, match="stop: release the stick first"):
         scene.pilot.drive(SECOND)
     await asyncio.sleep(0.1)
@@ -172,7 +172,7 @@ async def test_a_lease_that_is_kept_outlasts_the_deadman_and_then_neutral_is_nee
 async def test_neutral_that_the_gateway_demands_is_demanded_of_the_stick(scene: Scene) -> None:
     scene.make(BY_HAND)
     await scene.held()
-    scene.world.gateway.enforcer.hold_back("the link stalled", stops=True)
+    scene.world.gateway.enforcer.require_neutral("the link stalled", stops=True)
     scene.pilot.drive(SECOND)
     await asyncio.sleep(0.1)
     with pytest.raises(NeutralFirst, match="send a neutral drive first"):
@@ -249,7 +249,7 @@ async def test_modes_that_wait_are_bounded_and_end_with_the_lease() -> None:
     scene = Scene(served=False)
     waiting = [asyncio.ensure_future(scene.pilot.set_mode("manual")) for _ in range(8)]
     await asyncio.sleep(0.1)
-    with pytest.raises(TooFast, match="too many changes of the mode"):
+    with pytest.raises(RateLimited, match="too many changes of the mode"):
         await scene.pilot.set_mode("manual")
     await scene.pilot.close()
     outcomes = await asyncio.gather(*waiting, return_exceptions=True)

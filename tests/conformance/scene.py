@@ -32,7 +32,7 @@ def table(lines: str, judges: dict[str, dict[str, Any]]) -> pytest.MarkDecorator
     """Parametrise a test over ``options`` and ``steps``; a line is a sentence, the judge it is about, and a script.
 
     ``"a late probe | udp | probing; by_udp PROBE; ! too late"``; ``judges`` are the options by name. What is
-    indented more goes on with the line before.
+    indented more continues the line before.
     """
     found = {}
     for line in re.sub(r"\n {8,}", " ", lines).strip().splitlines():
@@ -211,13 +211,13 @@ class Scene:
         await self.peer.connect()
 
     async def again(self, _: str) -> None:
-        """Go on with a second connection; the first one stays as it is."""
+        """Continue with a second connection; the first one stays as it is."""
         self._former.append(self.peer)
         self.peer = Peer(self.peer.port)
         await self.peer.connect()
 
     async def back(self, _: str) -> None:
-        """Go on with the connection before."""
+        """Continue with the connection before."""
         self._former.append(self.peer)
         self.peer = self._former[0]
 

@@ -80,7 +80,7 @@ class Driving(RuleBasedStateMachine):
         self.stopped = False
         self.must_neutral = False
         self.not_rested: set[str] = set()
-        """The parts that moved when the robot was held back, and that had no neutral since."""
+        """The parts that moved when neutral was required, and that had no neutral since."""
         self.moving_parts: set[str] = set()
         self.on_its_own = False
         self.leases: list[Given] = []
@@ -193,9 +193,9 @@ class Driving(RuleBasedStateMachine):
         self.take_events(must_stop=how == "stop")
 
     @rule(stands=st.booleans())
-    def hold_back(self, stands: bool) -> None:
+    def require_neutral(self, stands: bool) -> None:
         """Become busy; or know that the robot stands, so that nobody need stop it."""
-        self.authority.hold_back("robot lost" if stands else "busy", stops=not stands)
+        self.authority.require_neutral("robot lost" if stands else "busy", stops=not stands)
         self.must_neutral = True
         self.not_rested |= self.moving_parts
         if stands:
@@ -239,9 +239,9 @@ class Driving(RuleBasedStateMachine):
         assert {event.what for event in self.authority.events()} <= {EventKind.REFUSED}
 
     @invariant()
-    def it_is_held_back_until_neutral_or_a_new_lease(self) -> None:
+    def it_needs_neutral_until_neutral_or_a_new_lease(self) -> None:
         if self.driver is not None:
-            assert self.is_held_back() == self.must_neutral
+            assert self.needs_neutral() == self.must_neutral
 
     # The model
 
@@ -276,7 +276,7 @@ class Driving(RuleBasedStateMachine):
         lease: Lease = getattr(self.authority, name)(shows, key, self.now)
         return lease
 
-    def is_held_back(self) -> bool:
+    def needs_neutral(self) -> bool:
         try:
             self.authority.motion.require_motion()
         except Refused:
@@ -307,7 +307,7 @@ class Driving(RuleBasedStateMachine):
 
     def obey(self, part: str, moving: bool) -> None:
         assert self.driver is not None
-        if moving and self.is_held_back():
+        if moving and self.needs_neutral():
             return
         self.authority.applied(part, self.now, moving=moving)
         self.driver.obeyed_at = self.now
@@ -320,7 +320,7 @@ class Driving(RuleBasedStateMachine):
             self.moving_parts.discard(part)
 
     def obey_by_itself(self) -> None:
-        if not self.is_held_back():
+        if not self.needs_neutral():
             self.authority.motion.sent_opaque()
             self.on_its_own = True
 
@@ -353,6 +353,6 @@ def test_over_any_course_of_events_the_robot_moves_only_for_its_one_driver() -> 
     run_state_machine_as_test(
         Driving,
         settings=settings(
-            max_examples=2 * settings().max_examples, stateful_step_count=50, deadline=None, print_blob=False
+            max_examples=settings().max_examples, stateful_step_count=50, deadline=None, print_blob=False
         ),
     )

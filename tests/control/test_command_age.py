@@ -131,11 +131,11 @@ def test_a_stale_renewal_is_answered_with_what_is_left() -> None:
     assert ann.renew(3.1).expires_in_s == LEASE_S
 
 
-def test_a_stale_neutral_ends_motion_and_leaves_the_robot_held_back() -> None:
+def test_a_stale_neutral_ends_motion_and_leaves_the_robot_needs_neutral() -> None:
     ann = Ann()
     ann.acquire()
     ann.command(1.0)
-    ann.authority.hold_back("the robot's link took nothing")
+    ann.authority.require_neutral("the robot's link took nothing")
     assert ann.command(1.1, 0.9, moving=False)
     with pytest.raises(NeutralFirst):
         ann.authority.motion.require_motion()

@@ -18,7 +18,7 @@ from zbridge.control.enforcer import SUSPENDED_S, Enforcer
 from zbridge.control.events import CommandSender
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import Standstill
-from zbridge.errors import NeutralFirst, TooFast
+from zbridge.errors import NeutralFirst, RateLimited
 from zbridge.fleet.messages import Acquire, Drive, FleetMessage, Mode, Motor, Raw, Text
 from zbridge.fleet.topics import KeySpace
 from zbridge.metrics import Metrics
@@ -90,7 +90,7 @@ async def test_a_machine_that_was_suspended_stops_its_robot_and_ends_the_lease_b
 
 async def test_motion_that_was_stopped_while_it_was_written_is_not_counted_as_motion() -> None:
     rig = Rig()
-    rig.enforcer.hold_back("the robot's link took nothing", stops=True)
+    rig.enforcer.require_neutral("the robot's link took nothing", stops=True)
     with pytest.raises(NeutralFirst):
         rig.enforcer.moved(PATH, FORWARD, rig.now, CommandSender("a", rig.now), moving=True)
     assert not rig.authority.motion.moving
@@ -110,7 +110,7 @@ async def test_limits_refuse_what_comes_too_often_and_slow_what_grows_too_fast_f
     rig.authority.acquire(Acquire(who="a"), rig.now)
     assert rig.drive() == Drive(forward=0.25), "a robot that was stopped begins from standing"
     rig.drive()
-    with pytest.raises(TooFast):
+    with pytest.raises(RateLimited):
         rig.drive()
 
 

@@ -137,7 +137,7 @@ exec 3<&0
 (trap 'echo stopped >"$1"; exit 0' TERM; read word; echo "$word" >"$1.word"; while :; do sleep 0.05; done) <&3 &
 exit 0
 """
-"""Hands its robot to a process that goes on without it."""
+"""Hands its robot to a process that continues without it."""
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="a namespace of processes needs root")

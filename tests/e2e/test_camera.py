@@ -47,7 +47,7 @@ class Listener:
 
 
 class Viewer:
-    """A deployed HQ program's connection to the relay: keeps all bytes that come."""
+    """A legacy HQ program's connection to the relay: keeps all bytes that come."""
 
     def __init__(self, port: int, *, reads: bool = True) -> None:
         until(lambda: self._connects(port), what="a relay that listens")

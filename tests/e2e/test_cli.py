@@ -6,7 +6,6 @@ import json
 import signal
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ import pytest
 from tests.e2e.conftest import Bench, device, end, listener, start, until
 from tests.e2e.rigs.robots import Robot
 from tests.ports import free_port
-from zbridge.protocol.plugin import find_protocol, protocol_names
+from zbridge.protocol.plugin import protocol_names
 
 ROOT = Path(__file__).parents[2]
 FILE = '[robot]\nname = "r1"\n' + device(1, options="gap = 1")
@@ -29,19 +28,6 @@ def zbridge(*arguments: str, module: str = "zbridge", timeout_s: float = 30.0) -
     )
 
 
-@pytest.mark.parametrize("protocol", protocol_names())
-def test_the_deployed_configurations_are_what_init_prints_and_check_takes_them(protocol: str, tmp_path: Path) -> None:
-    assert (ROOT / f"deploy/config/{protocol}.toml").read_text() == zbridge("init", protocol).stdout
-    if find_protocol(protocol).hq is not None:
-        assert (ROOT / f"deploy/config/hq-{protocol}.toml").read_text() == zbridge("init", protocol, "--hq").stdout
-    file, made = tmp_path / "arm.toml", zbridge("init", protocol, "--name", "arm-7").stdout
-    assert tomllib.loads(made)["robot"]["name"] == "arm-7"
-    file.write_text(made)
-    checked = zbridge("check", str(file))
-    assert (checked.returncode, checked.stderr) == (0, "")
-    assert f"fleet/arm-7, {protocol} at tcp://127.0.0.1:" in checked.stdout
-
-
 @pytest.mark.parametrize("module", ["zbridge", "gateways.tcpudp"])
 def test_a_bad_file_ends_run_and_the_error_names_file_key_and_value(module: str, tmp_path: Path) -> None:
     bad = tmp_path / "r1.toml"
@@ -50,34 +36,6 @@ def test_a_bad_file_ends_run_and_the_error_names_file_key_and_value(module: str,
     assert (ran.returncode, ran.stdout) == (2, "")
     assert f"{bad}: device.options.gap = 1: unknown key; expected one of udp, gap_s," in ran.stderr
     assert "Traceback" not in ran.stderr
-
-
-@pytest.mark.parametrize(
-    ("command", "code", "said"),
-    [
-        ("stop", 2, "ROBOT"),
-        ("stop r1 --all", 2, "--all"),
-        ("stop a%b", 2, "ROBOT = 'a%b': expected letters, digits, '_', '.' and '-' only\n"),
-        ("drive a%b", 2, "ROBOT = 'a%b': expected letters, digits, '_', '.' and '-' only\n"),
-        ("init tcpudp --name a%b", 2, "--name = 'a%b': expected letters, digits, '_', '.' and '-' only\n"),
-        ("echo /fleet/r1/pose", 2, "try 'fleet/r1/pose'\n"),
-        ("record --keys /fleet/** -o never.mcap", 2, "try 'fleet/**'\n"),
-        ("simulate tcpudp --listen tcp://127.0.0.1:0 --hq tcp://127.0.0.1:1", 2, "give either --listen"),
-        ("simulate tcpudp --drive 0.3", 2, "--drive is an HQ program's: expected with --hq"),
-        (f"simulate tcpudp --hq {NOBODY} --drive fast", 2, "drive = 'fast': expected FORWARD or FORWARD,TURN"),
-        ("simulate tcpudp --listen udp://127.0.0.1:1", 1, "expected tcp://host:port"),
-        ("simulate tcpudp --listen tcp://127.0.0.1:0 --camera 8000", 1, "expected tcp://host:port"),
-        ("simulate tcpudp --hq tcp://127.0.0.1:1 --camera 127.0.0.1:8000", 2, "--camera is a robot's"),
-        ("simulate tcpudp --listen tcp://127.0.0.1:0 --version 1.0", 2, "expected one of 1.1, 1.2, 1.3, 1.4"),
-        (f"probe tcpudp {NOBODY}", 2, "uses it up"),
-    ],
-)
-def test_what_cannot_be_done_is_said_without_a_traceback(command: str, code: int, said: str) -> None:
-    ran = zbridge(*command.split())
-    assert (ran.returncode, ran.stdout) == (code, "")
-    assert said in ran.stderr
-    assert "Traceback" not in ran.stderr
-    assert not (ROOT / "never.mcap").exists()
 
 
 def test_an_hq_program_that_finds_no_robot_says_so() -> None:

@@ -302,7 +302,7 @@ def test_hostile_viewers_are_refused_and_ended_and_nothing_moves_or_grows(bench:
             with socket.create_connection((HOST, server.port)) as stranger:
                 stranger.sendall(data)
         seen = len(quiet.shown["/r1/pose"])
-        quiet.until(lambda: len(quiet.shown["/r1/pose"]) > seen + 10, "poses go on")
+        quiet.until(lambda: len(quiet.shown["/r1/pose"]) > seen + 10, "poses continue")
         deaf.close()
         assert at(bench) == began
         assert holder(bench) is None

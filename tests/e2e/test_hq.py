@@ -83,7 +83,7 @@ async def test_a_process_without_a_robot_tells_its_programs_when_the_robot_comes
         program.idle()
         await drives()
         program.texts.clear()
-        await asyncio.to_thread(gateway.end)  # the programs go on meanwhile
+        await asyncio.to_thread(gateway.end)  # the programs continue meanwhile
         await soon(lambda: _GONE.intersection(program.texts), "told that it went")
         bench.gateway(simulated)
         await told("the robot is there")

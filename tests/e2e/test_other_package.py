@@ -68,7 +68,7 @@ def test_of_a_robot_that_has_no_hq_side_the_demo_says_so_and_a_listener_is_a_cle
         (line,) = run("zbridge", "check", str(file), code=code).splitlines()
         assert (f"protocol = 'torn': {why}" in line) is bool(code)
     shown = run("zbridge", "demo", "--seconds", "8")
-    assert f"zbridge: protocol = 'torn': {why}; the demo goes on without it\n" in shown
+    assert f"zbridge: protocol = 'torn': {why}; the demo continues without it\n" in shown
     assert "  toy1: serves no HQ programs" in shown
     assert "  alf1: zbridge simulate alf --hq tcp://127.0.0.1:" in shown
     row = [line for line in shown.splitlines() if "toy1" in line and "│" in line][-1]

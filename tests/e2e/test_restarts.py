@@ -70,7 +70,7 @@ async def test_old_hq_programs_stay_connected_and_drive_again_after_neutral(benc
         assert bench.fleet.last("r1/control")["holder"] == "hq.tcp.2"
 
     async with playing(program.run(HOST, tcp), vehicle.run(HOST, alf), controller.run(HOST, ec)):
-        await soon(lambda: program.position, "position")
+        await soon(lambda: program.position and bench.fleet.last("r1/pose"), "position")
         program.mode(2)
         program.idle()
         await drives()
@@ -101,7 +101,7 @@ def served(bench: Bench, robot: Robot, *more: str) -> Restarted:
 
 
 def refused(gateway: Restarted, robot: Robot, bench: Bench, reason: str) -> None:
-    """The restart is refused for this reason, and the gateway goes on: it takes commands, and telemetry flows."""
+    """The restart is refused for this reason, and the gateway continues: it takes commands, and telemetry flows."""
     (answer,) = gateway.ask()
     assert answer["code"] == "not_ready"
     assert re.search(reason, answer["reason"]), answer

@@ -1,4 +1,4 @@
-"""A robot that stalled, or whose link was cut, while it was driven: it is at rest soon after it goes on."""
+"""A robot that stalled, or whose link was cut, while it was driven: it is at rest soon after it continues."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ def within(seconds: float) -> Iterator[None]:
 
 
 def run_blind(target: Target, seconds: float, seed: int, most_bytes: int | None = None) -> Tally:
-    """Mutate inputs of a target for so long, or up to so many bytes; write down what is a finding, and go on."""
+    """Mutate inputs of a target for so long, or up to so many bytes; write down what is a finding, and continue."""
     chance, tally = random.Random(f"{target.name}/{seed}"), Tally()
     pool = [data for _, data in target.corpus()] + list(target.seeds())
     end = time.monotonic() + seconds

@@ -260,7 +260,7 @@ async def test_what_a_successor_needs_is_deposited_with_its_sockets(scene: Scene
     newer = deposit(scene, "established")
     assert newer.area != kept.area, "the one before it is still there if this process dies now"
     left.clear()
-    assert deposit(scene, "closing") == Deposited(), "nobody could go on any more"
+    assert deposit(scene, "closing") == Deposited(), "nobody could continue any more"
 
 
 async def test_another_stop_comes_with_another_deposit(scene: Scene, sock: socket.socket) -> None:

@@ -28,7 +28,7 @@ class Scene:
         self.running: dict[Path, RobotFile] = {}
 
     def poll(self, *, twice: bool = False) -> dict[str, list[str]]:
-        """Look, and do what the changes ask for; give the names of the files."""
+        """ReadPayload, and do what the changes ask for; give the names of the files."""
         changes = self.follower.poll(self.running, twice=twice)
         for old, file in changes.moved:
             del self.running[old]

@@ -342,7 +342,7 @@ STEPS: dict[str, Callable[[Scene, str], object]] = {
     "frozen": lambda scene, seconds: scene.skip(float(seconds)),
     "operator-drives": lambda scene, _: scene.gateway.authority.acquire(OPERATOR, scene.now),
     "operator-takes-over": lambda scene, _: scene.gateway.authority.takeover(OPERATOR, scene.now),
-    "gateway-refuses": lambda scene, why: scene.gateway.authority.hold_back(why),  # motion, until neutral is said
+    "gateway-refuses": lambda scene, why: scene.gateway.authority.require_neutral(why),  # motion, until neutral is said
     "gateway-forgets": lambda scene, _: scene.gateway.authority.stop("a new gateway knows of no lease"),
     "shown": lambda scene, _: scene.show(),
     "forget": lambda scene, _: scene.driven(),

@@ -82,9 +82,9 @@ async def test_a_listener_goes_on_without_what_its_protocol_fails_at_and_says_so
     records = [*caplog.get_records("setup"), *caplog.records]
     errors = [record.getMessage() for record in records if record.levelno == logging.ERROR]
     assert sorted(errors) == [
-        "toy: a client not sent: KeyError('unheard of'); going on without",
-        "toy: a message of a client not understood: KeyError(b'what is this'); going on without",
-        "toy: pose not shown: KeyError('pose'); going on without",
-        "toy: status not shown: KeyError('status'); going on without",
-        "toy: the robot's presence not shown: KeyError(True); going on without",
+        "toy: a client not sent: KeyError('unheard of'); continuing without it",
+        "toy: a message of a client not understood: KeyError(b'what is this'); continuing without it",
+        "toy: pose not shown: KeyError('pose'); continuing without it",
+        "toy: status not shown: KeyError('status'); continuing without it",
+        "toy: the robot's presence not shown: KeyError(True); continuing without it",
     ]

@@ -84,7 +84,7 @@ whoever lost the robot must say neutral, and not of a part only [driving]
     lost stop; not held; 0.1 motion ! stop: release the stick first; 0.1 neutral of a part -> nothing; 0.2 motion ! stop
     0.6 neutral -> nothing; 0.7 motion -> acquire; lost held by bob; not asking; 0.8 motion ! held by bob
     0.9 neutral -> nothing; 1.0 motion -> acquire
-a refused motion holds back and leaves the lease [driving]
+a refused motion makes neutral necessary and leaves the lease [driving]
     is may steer; refused busy: map; is held; not may steer; 0.5 motion ! busy: map: release the stick first
     0.6 neutral -> send; 0.7 motion -> send
 a program that gave the robot back need not say neutral anew [driving]

@@ -230,7 +230,7 @@ STEPS: dict[str, Callable[[Scene, str], object]] = {
     "operator-drives": lambda scene, _: scene.authority.acquire(OPERATOR, scene.now),
     "operator-takes-over": lambda scene, _: scene.authority.takeover(OPERATOR, scene.now),
     "somebody-stops": lambda scene, _: scene.authority.stop("stop"),
-    "busy": lambda scene, why: scene.authority.hold_back(why),
+    "busy": lambda scene, why: scene.authority.require_neutral(why),
     "bus-fails": lambda scene, _: scene.block(fails=True),
     "bus-blocked": lambda scene, _: scene.block(fails=False),
     "bus-freed": lambda scene, _: scene.freed.set(),

@@ -29,7 +29,7 @@ from gateways.tcpudp.options import TcpUdpOptions
 from gateways.tcpudp.translate import TcpUdpRobot
 from tests.clock import JumpingLoop
 from tests.proofs import Holder, numbered, packed
-from zbridge.bus import Handle, IncomingQuery, Lane, Sample
+from zbridge.bus import Handle, IncomingQuery, PriorityClass, Sample
 from zbridge.bus.fake import FakeBus, FakeQuery, meet
 from zbridge.bus.interface import Sort
 from zbridge.control.audit_log import Audit
@@ -99,23 +99,34 @@ class TimedLink(FakeLink):
 
 
 class OpenBus(FakeBus):
-    """Lets a test put a question whose answer comes later, and keeps the lanes that were asked for."""
+    """Lets a test put a question whose answer comes later, and keeps the priorities that were asked for."""
 
     def __init__(self) -> None:
         super().__init__("1")
         self.answers: dict[str, Callable[[IncomingQuery], None]] = {}
-        self.lanes: dict[str, Lane | Sort] = {}
+        self.priorities: dict[str, PriorityClass | Sort] = {}
 
-    def answer(self, key: str, handler: Callable[[IncomingQuery], None], *, lane: Lane | Sort = Lane.OTHER) -> Handle:
+    def answer(
+        self,
+        key: str,
+        handler: Callable[[IncomingQuery], None],
+        *,
+        priority: PriorityClass | Sort = PriorityClass.OTHER,
+    ) -> Handle:
         self.answers[key] = handler
-        self.lanes[key] = lane
-        return super().answer(key, handler, lane=lane)
+        self.priorities[key] = priority
+        return super().answer(key, handler, priority=priority)
 
     def subscribe(
-        self, key_expr: str, handler: Callable[[Sample], None], *, lane: Lane | Sort = Lane.OTHER, history: bool = False
+        self,
+        key_expr: str,
+        handler: Callable[[Sample], None],
+        *,
+        priority: PriorityClass | Sort = PriorityClass.OTHER,
+        history: bool = False,
     ) -> Handle:
-        self.lanes[key_expr] = lane
-        return super().subscribe(key_expr, handler, lane=lane, history=history)
+        self.priorities[key_expr] = priority
+        return super().subscribe(key_expr, handler, priority=priority, history=history)
 
 
 class Program:

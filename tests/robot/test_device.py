@@ -29,9 +29,9 @@ from tests.robot.scene import (
     established,
     serving,
 )
-from zbridge.bus import Lane, Sample
+from zbridge.bus import PriorityClass, Sample
 from zbridge.control.motion_limits import MotionLimits
-from zbridge.errors import Malformed, TooFast
+from zbridge.errors import Malformed, RateLimited
 from zbridge.fleet import topics
 from zbridge.robot.device import HEARTBEAT_S
 from zbridge.robot.telemetry import ATTEND_EVERY
@@ -502,7 +502,7 @@ async def test_a_question_in_another_name_with_wildcards_or_malformed_is_refused
 
 async def test_more_than_five_takeovers_a_second_are_refused_and_the_last_one_keeps_the_robot(rig: Rig) -> None:
     taken = [rig.ask("control/takeover/n", packed({"who": f"n.{number}"})).replies[0] for number in range(8)]
-    assert [type(reply.error) for reply in taken] == [type(None)] * 5 + [TooFast] * 3
+    assert [type(reply.error) for reply in taken] == [type(None)] * 5 + [RateLimited] * 3
     await rig.play("control held n.4\n refused n takeover: more than 5 takeovers a second x3\n 0.25")
     assert rig.ask("control/takeover/me%40here", packed({"who": "me@here"})).replies[0].error is None
 
@@ -528,7 +528,7 @@ async def test_tellings_are_bounded_and_so_is_what_they_say(rig: Rig) -> None:
     assert (unknown["code"], unknown["count"]) == ("unsupported", 1)
     for number in range(200):
         last = rig.ask("control/refused/hq.desk", telling({"reason": f"reason {number}"}))
-    assert isinstance(last.replies[0].error, TooFast)
+    assert isinstance(last.replies[0].error, RateLimited)
     await asyncio.sleep(0.06)
     codes = [entry["code"] for entry in rig.last("control")["refusals"]]
     assert (len(codes), codes.count("rate")) == (16, 1)
@@ -567,7 +567,7 @@ async def test_a_scan_that_is_sent_to_the_robot_is_shown_on_the_bus(rig: Rig) ->
     assert rig.last("scan")["ranges"] == TWO_METRES
 
 
-# What is written down, counted, and put in which lane
+# What is written down, counted, and with which priority it is served
 
 
 @pytest.mark.scene(hold=False, deadman_s=0.5)
@@ -590,30 +590,36 @@ async def test_the_audit_log_tells_who_drove_what_was_refused_and_what_stopped_t
     assert counted == {"acquired": 2, "stopped": 3, "ended": 1, "taken over": 1, "released": 1}
 
 
-def gate(rig: Rig, path: str) -> Callable[..., Lane | None]:
-    """Give what chooses the lane of a key, with a lane of the key's own."""
-    lane = rig.bus.lanes[f"fleet/r1/{path}"]
-    assert not isinstance(lane, Lane)
-    return lane
+def gate(rig: Rig, path: str) -> Callable[..., PriorityClass | None]:
+    """Return the admission filter of a key; the key has one of its own."""
+    priority = rig.bus.priorities[f"fleet/r1/{path}"]
+    assert not isinstance(priority, PriorityClass)
+    return priority
 
 
 async def test_the_holders_commands_and_questions_wait_for_nobody_elses_and_a_stop_for_nothing(rig: Rig) -> None:
     commands, held = gate(rig, "@cmd/**"), rig.driver.held
     assert held is not None
     proven = held.attachment("drive", b"")
-    lanes = [commands("fleet/r1/@cmd/drive", attachment, 60, bytes) for attachment in (None, proven, proven)]
-    assert lanes == [Lane.OTHER, Lane.COMMAND, Lane.OTHER]
-    assert commands("fleet/r1/@cmd/stop", None, 0, bytes) is commands("fleet/*/@cmd/stop", None, 0, bytes) is Lane.STOP
+    priorities = [commands("fleet/r1/@cmd/drive", attachment, 60, bytes) for attachment in (None, proven, proven)]
+    assert priorities == [PriorityClass.OTHER, PriorityClass.COMMAND, PriorityClass.OTHER]
+    assert (
+        commands("fleet/r1/@cmd/stop", None, 0, bytes)
+        is commands("fleet/*/@cmd/stop", None, 0, bytes)
+        is PriorityClass.STOP
+    )
     for key in ("@rpc/control/renew", "@rpc/control/release"):
-        assert gate(rig, key)(f"fleet/r1/{key}", held.question(key.rpartition("/")[2]), 60, bytes) is Lane.COMMAND
+        assert (
+            gate(rig, key)(f"fleet/r1/{key}", held.question(key.rpartition("/")[2]), 60, bytes) is PriorityClass.COMMAND
+        )
     for key in ("@rpc/control/acquire/", "@rpc/control/takeover/"):
-        assert gate(rig, f"{key}*")(f"fleet/r1/{key}me", packed({"who": "me"}), 10, bytes) is Lane.OTHER
+        assert gate(rig, f"{key}*")(f"fleet/r1/{key}me", packed({"who": "me"}), 10, bytes) is PriorityClass.OTHER
 
 
 async def test_what_the_gates_keep_back_is_shown_once_a_second_and_counted_like_any_refusal(rig: Rig) -> None:
     commands, acquires = gate(rig, "@cmd/**"), gate(rig, "@rpc/control/acquire/*")
-    passed = [commands("fleet/r1/@cmd/drive", None, 10, bytes) for _ in range(1000)].count(Lane.OTHER)
-    asked = [acquires("fleet/r1/@rpc/control/acquire/n", b"", 0, bytes) for _ in range(1000)].count(Lane.OTHER)
+    passed = [commands("fleet/r1/@cmd/drive", None, 10, bytes) for _ in range(1000)].count(PriorityClass.OTHER)
+    asked = [acquires("fleet/r1/@rpc/control/acquire/n", b"", 0, bytes) for _ in range(1000)].count(PriorityClass.OTHER)
     for _ in range(2):  # shown and counted once
         await asyncio.sleep(1.1)
         kept_back = [
@@ -624,11 +630,11 @@ async def test_what_the_gates_keep_back_is_shown_once_a_second_and_counted_like_
 
 
 async def test_a_stop_right_after_a_stop_is_not_carried_out_again(rig: Rig) -> None:
-    lane, stop = gate(rig, "@cmd/**"), ("fleet/r1/@cmd/stop", None, 0, bytes)
+    priority, stop = gate(rig, "@cmd/**"), ("fleet/r1/@cmd/stop", None, 0, bytes)
     await rig.play("stop")
-    assert lane(*stop) is None
+    assert priority(*stop) is None
     await asyncio.sleep(1.1)
-    assert lane(*stop) is Lane.STOP
+    assert priority(*stop) is PriorityClass.STOP
     assert rig.metrics.total("stops_folded") == 1
 
 

@@ -11,7 +11,7 @@ import pytest
 from tests.proofs import packed
 from tests.robot.scene import STOP, OpenBus, Rig
 from tests.robot.test_device import established, serving
-from zbridge.bus import Answer, Lane
+from zbridge.bus import Answer, PriorityClass
 from zbridge.control.latch import Latches, LatchRecord
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Latch
@@ -109,21 +109,21 @@ async def test_a_stop_is_the_fleets_only_by_its_very_key(key: str, fleet: bool) 
 
 async def test_the_gate_lets_every_id_through_once_and_folds_what_repeats_it() -> None:
     async with established() as rig:
-        lane = rig.bus.lanes["fleet/r1/@cmd/**"]
-        assert callable(lane)
+        priority = rig.bus.priorities["fleet/r1/@cmd/**"]
+        assert callable(priority)
 
-        def sorted_as(payload: bytes) -> Lane | None:
-            return lane("fleet/r1/@cmd/stop", None, len(payload), lambda: payload)  # type: ignore[operator]
+        def sorted_as(payload: bytes) -> PriorityClass | None:
+            return priority("fleet/r1/@cmd/stop", None, len(payload), lambda: payload)  # type: ignore[operator]
 
         named = packed({"id": IDS[0], "latch": True})
-        assert sorted_as(b"") is sorted_as(packed({"latch": True})) is sorted_as(b"\xc1") is Lane.STOP
-        assert sorted_as(named) is Lane.LATCH
+        assert sorted_as(b"") is sorted_as(packed({"latch": True})) is sorted_as(b"\xc1") is PriorityClass.STOP
+        assert sorted_as(named) is PriorityClass.LATCH
         latch(rig, IDS[0])
         await rig.settle()
         assert sorted_as(b"") is sorted_as(named) is None, "these change nothing now"
-        assert sorted_as(packed({"id": IDS[1]})) is Lane.LATCH
+        assert sorted_as(packed({"id": IDS[1]})) is PriorityClass.LATCH
         await asyncio.sleep(0.06)
-        assert sorted_as(named) is Lane.LATCH, "a while later it is a stop again"
+        assert sorted_as(named) is PriorityClass.LATCH, "a while later it is a stop again"
 
 
 # Other gateways of the fleet

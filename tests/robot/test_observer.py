@@ -1,4 +1,4 @@
-"""What somebody outside must know to stop a robot whose gateway dies, and how the next gateway goes on."""
+"""What somebody outside must know to stop a robot whose gateway dies, and how the next gateway continues."""
 
 from __future__ import annotations
 

@@ -95,7 +95,7 @@ async def test_neutral_and_push_that_waited_in_a_cut_move_nothing() -> None:
             waiting.append(Sample("fleet/r1/@cmd/drive", payload, ann.held.attachment(name, payload, ann.t)))
             await asyncio.sleep(0.05)
         rig.forget_written()
-        for sample in waiting[:-9]:  # the rest is in time, and comes behind a hold-back
+        for sample in waiting[:-9]:  # the rest is in time, and comes when neutral is required already
             rig.driver.put("drive", sample.payload, sample.attachment)
         await asyncio.sleep(0.3)
         assert set(words(rig)) <= {"stop"}

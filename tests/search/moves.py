@@ -95,9 +95,9 @@ def _of_others(world: World, bounds: Bounds) -> Iterator[Move]:
             yield f"latch {latch}", lambda world, latch=latch: world.stop(latch)
             yield f"unlatch {latch}", lambda world, latch=latch: world.unlatch(latch)
     if "link" in faults:
-        yield "link stalls", lambda world: world.hold_back(stops=True)
+        yield "link stalls", lambda world: world.require_neutral(stops=True)
     if "offline" in faults:
-        yield "robot lost", lambda world: world.hold_back(stops=False)
+        yield "robot lost", lambda world: world.require_neutral(stops=False)
     if "bus" in faults:
         yield "bus lost", _lose_bus
     if "later" in faults:

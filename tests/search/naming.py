@@ -54,8 +54,8 @@ class _Namer:
             self._filters(),
             tuple(self._program(number) for number in range(len(world.holders))),
             tuple(sorted(map(self._message, world.net))),
-            tuple((lane.value, command.program, command.what, self._shown(command),
-                   self._age(command.given_ms)) for lane, command in world.inbox),
+            tuple((priority.value, command.program, command.what, self._shown(command),
+                   self._age(command.given_ms)) for priority, command in world.inbox),
             tuple((command.program, command.what, self._shown(command), self._since(sender.given_at), sender.stale)
                   for command, sender in world.hand),
             (tuple(sorted(world.robot.parts)), world.robot.autonomous, world.ready,
@@ -166,7 +166,7 @@ class _Namer:
         return (
             authority.machine.state.value, motion.on_its_own, motion.autonomous,
             tuple(sorted(motion.parts)), tuple(sorted(motion.moved)),
-            self._ago(motion.stop_at), motion.held_back or "", tuple(map(self._lease, self._known())),
+            self._ago(motion.stop_at), motion.needs_neutral or "", tuple(map(self._lease, self._known())),
             tuple(authority.latches._in_force), tuple(sorted(authority.latches._released)),
             tuple(sorted(authority.latches._released_fleet)), _stops(tuple(authority.latches._stops)),
         )  # fmt: skip

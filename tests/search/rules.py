@@ -233,7 +233,7 @@ def _unlatched(account: Account, world: World, latch: Any) -> Account:
     return account._replace(latched=account.latched - {latch}, released=account.released | {latch})
 
 
-def _held_back(account: Account, world: World, said: Any) -> Account:
+def _neutral_required(account: Account, world: World, said: Any) -> Account:
     return _owes(account)
 
 
@@ -263,6 +263,6 @@ _FOLLOW = {
     "stop": _stopped,
     "folded": _folded,
     "unlatched": _unlatched,
-    "held back": _held_back,
+    "neutral required": _neutral_required,
     "event": _event,
 }

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from zbridge.bus import Answer, Lane
+from zbridge.bus import Answer, PriorityClass
 from zbridge.control.admission import CommandFilter, QueryFilter
 from zbridge.control.authority import Authority
 from zbridge.control.events import AuthorityEvent, CommandSender, EventKind
@@ -183,7 +183,7 @@ class World:
         self.hand: list[tuple[Command, CommandSender]] = []
         """The command that was admitted and is not yet recorded."""
         self.net: list[Message] = []
-        self.inbox: list[tuple[Lane, Command]] = []
+        self.inbox: list[tuple[PriorityClass, Command]] = []
         self.news: list[Control | None] = [None for _ in programs]
         self.told: list[tuple[int, LeaseEvent]] = []
         """Events of the programs in the last move."""
@@ -241,13 +241,13 @@ class World:
     def arrive(self, command: Command) -> None:
         """Let a command pass its admission filter, on the bus's thread, into the inbox."""
         key, payload = PAYLOADS[command.what]
-        lane = self.admission(key, command.attachment, len(payload) + len(command.attachment), lambda: payload)
-        if lane is not None:
-            self.inbox.append((lane, command))
+        priority = self.admission(key, command.attachment, len(payload) + len(command.attachment), lambda: payload)
+        if priority is not None:
+            self.inbox.append((priority, command))
 
     def attend(self) -> None:
         """Carry out what waits in the inbox, on the event loop."""
-        waiting, self.inbox = sorted(self.inbox, key=lambda item: item[0] is not Lane.COMMAND), []
+        waiting, self.inbox = sorted(self.inbox, key=lambda item: item[0] is not PriorityClass.COMMAND), []
         for _, command in waiting:
             self._take(command)
 
@@ -365,12 +365,12 @@ class World:
         self.decisions.append(("unlatched", latch))
         self.settle()
 
-    def hold_back(self, *, stops: bool) -> None:
+    def require_neutral(self, *, stops: bool) -> None:
         """Let the robot's link stall, or be lost: then the robot is stopped by itself."""
         if not stops:
             self.robot.rest()
-        self.decisions.append(("held back", None))
-        self.authority.hold_back("link", stops=stops)
+        self.decisions.append(("neutral required", None))
+        self.authority.require_neutral("link", stops=stops)
         self.settle()
 
     def settle(self) -> None:

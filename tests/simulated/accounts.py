@@ -72,7 +72,7 @@ class Grant:
         self.autonomous = False
         self.last_motion: Command | None = None
         self.last_mode: Command | None = None
-        self.held_back = False
+        self.needs_neutral = False
         self.used = False
         """Whether anything was sent with it."""
 
@@ -112,7 +112,7 @@ class Grant:
             return
         if not command.value:
             if late_s < 0.3:
-                self.held_back = False
+                self.needs_neutral = False
             self.last_motion, self.autonomous = None, False
             return
         if command.dated and late_s > min(MAX_AGE_S, self.deadman_s) + 0.05:
@@ -121,8 +121,8 @@ class Grant:
         if last is not None:
             since_s = now - (last.given_at if last.dated else last.received[self.gateway])
             if since_s > self.deadman_s + self.base_s + 0.1:
-                self.held_back = True
-        if self.held_back:
+                self.needs_neutral = True
+        if self.needs_neutral:
             command.forbidden = "neutral first"
         else:
             self.last_motion = command

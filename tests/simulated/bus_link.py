@@ -5,8 +5,8 @@ is cut keeps what it is given (of messages that may be dropped: what fits into t
 after the cut: at a moment of its back-off, which doubles from :data:`RTO_S`, so at most as long after the cut as the
 cut lasted. Where only the acknowledgements are cut, TCP's window lets a few messages through. An end that hears nothing
 for :data:`LEASE_S`, keep-alives included, gives the link up; the other end learns of that if its path works, else when
-it is back, or gives up by itself. Then end 0 connects anew (:class:`Retry`): an attempt into a cut path goes on as the
-kernel repeats it; where end 0 was first to give up, and TCP still has something to send again, it waits for that.
+it is back, or gives up by itself. Then end 0 connects anew (:class:`Retry`): an attempt into a cut path continues as
+the kernel repeats it; where end 0 was first to give up, and TCP still has something to send again, it waits for that.
 """
 
 from __future__ import annotations

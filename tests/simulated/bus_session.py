@@ -13,7 +13,7 @@ from tests.simulated.bus import NEWS_S, Fabric, SimSession
 from tests.simulated.engine import THREAD_S
 from zbridge.bus.fake import matches, meet
 from zbridge.bus.inbox import Inbox
-from zbridge.bus.interface import Answer, Lane, Sample
+from zbridge.bus.interface import Answer, PriorityClass, Sample
 from zbridge.bus.late_join import LateJoin
 from zbridge.errors import BusError, Refused
 from zbridge.fleet.topics import Congestion, is_concrete
@@ -112,7 +112,7 @@ class SimBus:
         key_expr: str,
         handler: Callable[[Sample], None],
         *,
-        lane: Any = Lane.OTHER,
+        priority: Any = PriorityClass.OTHER,
         history: bool = False,
         kept: bool = False,
         direct: bool = False,
@@ -122,13 +122,13 @@ class SimBus:
         source = self._inbox.source(handler)
 
         def store(sample: Sample) -> None:
-            if isinstance(lane, Lane):
-                source.put(sample, lane)
+            if isinstance(priority, PriorityClass):
+                source.put(sample, priority)
                 return
             size = len(sample.payload) + len(sample.attachment or b"")
-            chosen = lane(sample.key, sample.attachment, size, lambda: sample.payload)
+            chosen = priority(sample.key, sample.attachment, size, lambda: sample.payload)
             self.fabric.world.note(self.session.process.name, "receives", sample.key, sample.payload, sample.attachment)
-            if chosen is Lane.STOP:
+            if chosen is PriorityClass.STOP:
                 source.fold(Sample(sample.key, b"", sample.attachment), chosen)
             elif chosen is not None:
                 source.put(sample, chosen, size)
@@ -140,14 +140,14 @@ class SimBus:
     # Queries
 
     def answer(
-        self, key: str, handler: Callable[[Any], None], *, lane: Any = Lane.OTHER, complete: bool = False
+        self, key: str, handler: Callable[[Any], None], *, priority: Any = PriorityClass.OTHER, complete: bool = False
     ) -> Any:
         source = self._inbox.source(handler)
 
         def store(query: SimQuery) -> bool:
-            chosen = lane
-            if not isinstance(lane, Lane):
-                chosen = lane(query.asked, query.payload or None, len(query.payload), bytes)
+            chosen = priority
+            if not isinstance(priority, PriorityClass):
+                chosen = priority(query.asked, query.payload or None, len(query.payload), bytes)
             if chosen is None:
                 return False
             source.put(query, chosen, len(query.payload))
@@ -192,7 +192,7 @@ class SimBus:
 
     def watch_alive(self, key_expr: str, handler: Callable[[str, bool], None]) -> Any:
         source = self._inbox.source(lambda change: handler(*change))
-        entry = (key_expr, lambda key, alive: source.put((key, alive), Lane.STOP))
+        entry = (key_expr, lambda key, alive: source.put((key, alive), PriorityClass.STOP))
         self._watchers.append(entry)
         for key in sorted({key for _, key in self.session.known}):
             if matches(key_expr, key):

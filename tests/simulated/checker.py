@@ -378,7 +378,7 @@ class Checker:
         self.obligations.probed()
 
     def ended(self) -> None:
-        """Look for what is left after all processes were told to end."""
+        """ReadPayload for what is left after all processes were told to end."""
         for error in self.world.errors:
             self.violate("exception", error)
         for member in self.simulation.members.values():

@@ -97,7 +97,7 @@ class FleetRules:
             own[stop_id] = self._world.now
 
     def tick(self) -> None:
-        """Look for latched stops that a gateway has not learnt."""
+        """ReadPayload for latched stops that a gateway has not learnt."""
         for gateway, since in self._here_since.items():
             if self._world.now - since < ADOPTED_S or not self._checker.obligations.serves(gateway):
                 continue

@@ -54,8 +54,8 @@ MUTANTS = (
         "deadman sends no stop",
         None,
         MACHINE,
-        "cause.reason, stops=cause.stops))\n        motion.hold_back",
-        "cause.reason, stops=False))\n        motion.hold_back",
+        "cause.reason, stops=cause.stops))\n        motion.require_neutral",
+        "cause.reason, stops=False))\n        motion.require_neutral",
     ),
     Mutant(
         "timer not armed",
@@ -65,18 +65,18 @@ MUTANTS = (
         "if False:",
     ),
     Mutant(
-        "hold-back forgotten",
+        "required neutral forgotten",
         None,
         MOTION,
-        "        if self.held_back is not None:\n            raise NeutralFirst",
+        "        if self.needs_neutral is not None:\n            raise NeutralFirst",
         "        if False:\n            raise NeutralFirst",
     ),
     Mutant(
-        "hold-back ends with motion",
+        "required neutral ends with motion",
         None,
         MOTION,
-        "        self._still()\n        self.held_back = reason\n",
-        "        self._still()\n        self.held_back = None\n",
+        "        self._still()\n        self.needs_neutral = reason\n",
+        "        self._still()\n        self.needs_neutral = None\n",
     ),
     # the lease: expiry, token, proof
     Mutant(
@@ -245,7 +245,7 @@ MUTANTS = (
         "drives wait for a stalled link for ever",
         "situations",
         PRESENCE,
-        '            self._enforcer.hold_back("the robot\'s link took nothing", stops=True)',
+        '            self._enforcer.require_neutral("the robot\'s link took nothing", stops=True)',
         "            pass",
     ),
     Mutant(
@@ -285,7 +285,7 @@ MUTANTS = (
         "if False:",
     ),
     Mutant(
-        "a yielded gateway goes on",
+        "a yielded gateway continues",
         "ownership",
         "zbridge/app/serving.py",
         "        await self._device.step_aside()\n",
@@ -404,7 +404,7 @@ MUTANTS = (
     ),
     Mutant("old neutral counts at once", "situations", INTENT, "        if self._waited:\n", "        if False:\n"),
     Mutant(  # both: what was queued meanwhile takes the robot from its program too
-        "a frozen listener goes on",
+        "a frozen listener continues",
         "situations",
         "zbridge/hq/freeze.py",
         "        if frozen_s >= FROZEN_S:",

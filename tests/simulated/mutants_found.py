@@ -137,7 +137,7 @@ FOUND = (
         "",
     ),
     _mutant(
-        "a gateway that yielded goes on repeating its stop",
+        "a gateway that yielded continues repeating its stop",
         "zbridge/protocol/outbox.py",
         "            for place in (self._queue, self._urgent, self._slots):\n",
         "            for place in (self._queue, self._urgent):\n",

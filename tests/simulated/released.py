@@ -129,7 +129,7 @@ class Released:
         return next(each.name for each in self._checker.gateways.values() if each.host.name == host)
 
     def tick(self) -> None:
-        """Look for leases that nobody uses, and for a robot that nobody serves."""
+        """ReadPayload for leases that nobody uses, and for a robot that nobody serves."""
         paths = self._simulation.paths
         if paths.cuts or paths.slow or paths.loss or paths.duplicates:
             self._noisy_at = self._world.now

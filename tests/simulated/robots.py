@@ -1,6 +1,6 @@
 """Simulated robots, written from the protocol pages alone: each keeps an account of what it read and whether it moves.
 
-They read like the deployed programs. A TCP/UDP robot takes all that one read gives as one packet; one of 1.1 or 1.2
+They read like the legacy programs. A TCP/UDP robot takes all that one read gives as one packet; one of 1.1 or 1.2
 ignores the first packet that it reads alone after a stall. Mode 3 drives by itself. Some never stop by themselves.
 Each notes ``reads`` (what, value, how) and ``moving`` (whether, why).
 """
@@ -146,7 +146,7 @@ class SimRobot(Process):
             self.world.note(self.name, "moving", moving, why)
 
     def crash(self, why: str) -> None:
-        """End as the deployed program does when it is sent what it cannot bear."""
+        """End as the legacy program does when it is sent what it cannot bear."""
         if self.crashed is None:
             self.crashed = why
             self.world.note(self.name, "crashed", why)

@@ -29,7 +29,7 @@ class ServedRules:
         """Follow the trace."""
 
     def tick(self) -> None:
-        """Look for a robot that a gateway reaches, and leaves to one that does not."""
+        """ReadPayload for a robot that a gateway reaches, and leaves to one that does not."""
         now, checker = self._world.now, self._checker
         only = self._reaches_alone()
         if only != self._only[0]:

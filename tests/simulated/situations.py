@@ -156,7 +156,7 @@ def _busy_program(rng: random.Random, made: Made) -> None:
 
 
 def _pushed_while_away(rng: random.Random, made: Made) -> None:
-    """An HQ program begins to push while no gateway serves the robot, and goes on when one does."""
+    """An HQ program begins to push while no gateway serves the robot, and continues when one does."""
     _stick(rng, made, alone=True)
     t = rng.uniform(5.0, 7.0)
     kill = _fault(t, "kill", target="gw1", **{"for": rng.uniform(2.5, 4.0)})

@@ -248,7 +248,7 @@ class SimTransport:
         self._reading = True
         self._queued = False
         self._over: list[Exception | None] = []
-        self._held_back = False
+        self._writing_paused = False
         end = self._end
         end.process = loop.process
         end.on_data, end.on_close, end.on_ack = self._readable, self._ended, self._acknowledged
@@ -283,8 +283,8 @@ class SimTransport:
             return
         self._loop.world.note(self._loop.process.name, "writes", self._end.peer.address, bytes(data)[:40].hex())
         self._end.send(bytes(data))
-        if self.get_write_buffer_size() and not self._held_back:
-            self._held_back = True
+        if self.get_write_buffer_size() and not self._writing_paused:
+            self._writing_paused = True
             self._protocol.pause_writing()
 
     def is_reading(self) -> bool:
@@ -344,8 +344,8 @@ class SimTransport:
         self._readable()
 
     def _acknowledged(self) -> None:
-        if self._held_back and not self.get_write_buffer_size():
-            self._held_back = False
+        if self._writing_paused and not self.get_write_buffer_size():
+            self._writing_paused = False
             self._loop.call_soon(self._protocol.resume_writing)
 
     def _lose(self, error: Exception | None) -> None:

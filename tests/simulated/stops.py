@@ -78,7 +78,7 @@ class StopRules:
             self._stopped_at[gateway] = self._world.now
 
     def tick(self) -> None:
-        """Look for a robot that nobody drives, and that is sent no stop."""
+        """ReadPayload for a robot that nobody drives, and that is sent no stop."""
         now, checker = self._world.now, self._checker
         gateway = checker.obligations.works()
         if gateway != self._works[0]:

@@ -65,7 +65,7 @@ class Written:
             if gateway is not None:
                 self._owes[gateway] = "since the robot was connected"
                 self._moves.discard(gateway)
-                self._hold_back(gateway)
+                self._require_neutral(gateway)
         elif what == "withdraws" and who in self._checker.gateways and fields[0].endswith("/@alive/gateway"):
             self._on_aside(who)
         elif what == "announces" and fields[0].endswith("/@alive/gateway"):
@@ -113,12 +113,12 @@ class Written:
             if end.process.name == gateway:
                 self._open[gateway] = (end, self._world.now)
 
-    def _hold_back(self, gateway: str) -> None:
-        """Whoever held a robot that was lost must say neutral: docs/control.md, "hold back"."""
+    def _require_neutral(self, gateway: str) -> None:
+        """Whoever held a robot that was lost must say neutral: docs/control.md, "require neutral"."""
         _, open_at = self._open.pop(gateway, (None, 0.0))
         grant = self._checker.current.get(gateway)
         if grant is not None and grant.ended_at is None and grant.at < open_at:
-            grant.held_back = True
+            grant.needs_neutral = True
             self._checker.counts["a held robot was lost, and is back"] += 1
 
     def _look_aside(self, gateway: str, data: bytes) -> None:

@@ -1,4 +1,4 @@
-"""The simulated camera: its pictures are JPEGs that a decoder reads, and it streams as deployed robots do."""
+"""The simulated camera: its pictures are JPEGs that a decoder reads, and it streams as legacy robots do."""
 
 from __future__ import annotations
 

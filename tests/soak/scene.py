@@ -170,7 +170,7 @@ class Scene:
         self.faults += [f"{name}: {text[:200]}" for text in said if _JOINED not in text]
 
     def replace(self, name: str) -> None:
-        """Start a robot's program again: deployed ones give one usable connection per start."""
+        """Start a robot's program again: legacy ones give one usable connection per start."""
         old = self.robots[name]
         self.judge(name)
         events = [*old.report.get("events", ())][-3:]

@@ -64,7 +64,7 @@ def main(modules: Path, pictures: Path) -> None:
 
 
 def live(page: Page, bench: Bench, pictures: Path) -> None:
-    """Look at the robot, drive it by the Teleop panel, stop it by the button."""
+    """ReadPayload at the robot, drive it by the Teleop panel, stop it by the button."""
     stop = page.get_by_role("button", name="STOP")
     stop.wait_for(timeout=_WAIT_MS)
     page.wait_for_timeout(LOAD_S * 1000)
@@ -107,7 +107,7 @@ def teleop(page: Page) -> tuple[float, float]:
 
 
 def played(page: Page, port: int, pictures: Path) -> None:
-    """Look at a recording that our server plays; another program presses its buttons."""
+    """ReadPayload at a recording that our server plays; another program presses its buttons."""
     page.wait_for_timeout(LOAD_S * 1000)
     tidy(page)
     with viewing(port) as control:

@@ -94,9 +94,9 @@ async def test_what_comes_while_nothing_is_read_is_dropped_and_told() -> None:
 async def test_samples_that_come_too_fast_are_dropped_before_they_are_copied() -> None:
     link = Scene().link
     sort = link._sort()
-    lanes = [sort("k", None, 0, bytes) for _ in range(5000)]
-    assert 1990 <= sum(lane is not None for lane in lanes) <= 3000
-    assert link._above == lanes.count(None)
+    priorities = [sort("k", None, 0, bytes) for _ in range(5000)]
+    assert 1990 <= sum(priority is not None for priority in priorities) <= 3000
+    assert link._above == priorities.count(None)
 
 
 async def test_keys_are_bounded() -> None:

@@ -38,7 +38,7 @@ class Line:
         self.link = link
 
     async def read(self, size: int) -> bytes:
-        """Read ``size`` bytes; whoever writes goes on meanwhile."""
+        """Read ``size`` bytes; whoever writes continues meanwhile."""
         data = b""
         async with asyncio.timeout(SOON_S):
             while len(data) < size:

@@ -76,24 +76,23 @@ async def _accept(listening: socket.socket, clients: Clients, metrics: Metrics, 
                 await asyncio.sleep(REQUEST_S)
                 continue
             if len(clients) >= CLIENTS:
-                _close(clients, next(iter(clients)))
+                oldest = next(iter(clients))
+                del clients[oldest]
+                oldest.cancel()
             task = asyncio.create_task(_serve(client, metrics, missing))
             clients[task] = client
-            task.add_done_callback(functools.partial(_close, clients))
+            task.add_done_callback(functools.partial(_close, clients, client))
             await asyncio.sleep(PAUSE_S)
     finally:
-        ending = tuple(clients)
-        for task in ending:
-            _close(clients, task)
-        await asyncio.gather(*ending, return_exceptions=True)
+        for task in clients:
+            task.cancel()
+        await asyncio.gather(*clients, return_exceptions=True)
 
 
-def _close(clients: Clients, task: asyncio.Task[None]) -> None:
-    """End a client; idempotent."""
-    task.cancel()
-    client = clients.pop(task, None)
-    if client is not None:
-        client.close()
+def _close(clients: Clients, client: socket.socket, task: asyncio.Task[None]) -> None:
+    """Close a client whose task is over: before that, the event loop still watches the descriptor."""
+    clients.pop(task, None)
+    client.close()
 
 
 async def _serve(client: socket.socket, metrics: Metrics, missing: Missing) -> None:

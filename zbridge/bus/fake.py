@@ -12,7 +12,7 @@ from typing import TypeVar
 
 import msgspec
 
-from zbridge.bus.interface import Answer, Batch, Handle, IncomingQuery, Lane, Publisher, Sample, Sort
+from zbridge.bus.interface import Answer, Batch, Handle, IncomingQuery, PriorityClass, Publisher, Sample, Sort
 from zbridge.errors import Refused
 from zbridge.fleet.topics import Topic, is_concrete, matches
 from zbridge.metrics import Metrics
@@ -110,13 +110,13 @@ class FakeBus:
         key_expr: str,
         handler: Callable[[Sample], None],
         *,
-        lane: Lane | Sort = Lane.OTHER,
+        priority: PriorityClass | Sort = PriorityClass.OTHER,
         history: bool = False,
         kept: bool = False,
         direct: bool = False,
     ) -> Handle:
         entry = (key_expr, handler)
-        self.network.lanes[key_expr] = lane
+        self.network.priorities[key_expr] = priority
         self.network.subscribers.append(entry)
         if history or kept:
             for key, payload in tuple(self.network.last.items()):
@@ -129,7 +129,7 @@ class FakeBus:
         key: str,
         handler: Callable[[IncomingQuery], None],
         *,
-        lane: Lane | Sort = Lane.OTHER,
+        priority: PriorityClass | Sort = PriorityClass.OTHER,
         complete: bool = False,
     ) -> Handle:
         entry = (key, handler, self._zid)
@@ -209,7 +209,7 @@ class FakeNetwork:
 
     def __init__(self) -> None:
         self.subscribers: list[tuple[str, Callable[[Sample], None]]] = []
-        self.lanes: dict[str, Lane | Sort] = {}
+        self.priorities: dict[str, PriorityClass | Sort] = {}
         """What the last subscriber of each key expression gave; a fake bus itself sorts nothing."""
         self.queryables: list[tuple[str, Callable[[IncomingQuery], None], str]] = []
         self.tokens: list[str] = []

@@ -1,11 +1,12 @@
 """Carries what Zenoh's threads bring to the event loop. Knows no zenoh.
 
-Theory of operation. Every subscription and every queryable has a :class:`Source`, with one bounded queue for each lane
-it uses: a flood of one source fills no other's queue. Only the lane COMMAND has one queue for all sources: the holder's
-commands and queries keep their order, and a release must not overtake the neutral before it. A queue that has items is
-listed in the line of its lane. The event loop is woken once per batch. A batch serves the lanes in their order, one
-item of each listed queue by turns, and of each lane no more than its share: a stop waits for one item at most, and a
-lane that never empties leaves the others their share. The rest is served after the loop's turn with sockets and timers.
+Theory of operation. Every subscription and every queryable has a :class:`Source`, with one bounded queue for each
+priority class it uses: a flood of one source fills no other's queue. Only COMMAND has one queue for all sources: the
+holder's commands and queries keep their order, and a release must not overtake the neutral before it. A queue that has
+items is listed in the line of its class. The event loop is woken once per batch. A batch serves the classes by
+priority, one item of each listed queue in turn, and of each class no more than its share: a stop waits for one item at
+most, and a class that never empties leaves the others their share. The rest is served after the loop has served sockets
+and timers.
 
 Several threads fill a queue and the loop's thread empties it, without a lock: every step is one operation of a deque,
 and an item is added before its queue is listed. A queue that is listed twice is harmless.
@@ -20,28 +21,28 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from zbridge.bus.interface import Lane
+from zbridge.bus.interface import PriorityClass
 from zbridge.metrics import Count, Metrics
 
 log = logging.getLogger("zbridge.bus")
 
 QUEUE = 4096
-"""Items of one source that may wait in a lane; one more drops the oldest."""
+"""Items of one source and one priority class that may wait; one more drops the oldest."""
 QUEUE_BYTES = 4 * 2**20
-"""Bytes of one source's items that may wait in a lane; more drop the oldest."""
-SHARES = {Lane.STOP: 64, Lane.LATCH: 64, Lane.COMMAND: 128, Lane.OTHER: 64}
-"""Items of each lane that one batch serves at most."""
+"""Bytes of one source's items of one priority class that may wait; more drop the oldest."""
+SHARES = {PriorityClass.STOP: 64, PriorityClass.LATCH: 64, PriorityClass.COMMAND: 128, PriorityClass.OTHER: 64}
+"""Items of each priority class that one batch serves at most."""
 
 Handler = Callable[[Any], None]
 Read = Callable[[Any], Any]
 
 
 class Inbox:
-    """Serves the queues of all sources, lane by lane, on the event loop."""
+    """Serves the queues of all sources by priority, on the event loop."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop, metrics: Metrics) -> None:
         self._loop = loop
-        self._lines: dict[Lane, deque[_Queue]] = {lane: deque() for lane in Lane}
+        self._lines: dict[PriorityClass, deque[_Queue]] = {priority: deque() for priority in PriorityClass}
         self.commands = _Queue()
         self._awake = False
         self._dropped = metrics.count("bus_in_dropped")
@@ -55,14 +56,14 @@ class Inbox:
         return Source(self, handler, read, self._dropped, self._folded)
 
     def attend(self) -> None:
-        """Serve the stops and commands that wait, no other lane."""
-        self._serve({**SHARES, Lane.OTHER: 0})
+        """Serve the stops and commands that wait, and nothing else."""
+        self._serve({**SHARES, PriorityClass.OTHER: 0})
 
-    def line_up(self, queue: _Queue, lane: Lane) -> None:
-        """List a queue in the line of its lane and wake the loop; from any thread."""
+    def line_up(self, queue: _Queue, priority: PriorityClass) -> None:
+        """List a queue in the line of its priority class and wake the loop; from any thread."""
         if not queue.listed:
             queue.listed = True
-            self._lines[lane].append(queue)
+            self._lines[priority].append(queue)
         if not self._awake:
             self._awake = True
             with contextlib.suppress(RuntimeError):  # the loop has ended
@@ -75,13 +76,13 @@ class Inbox:
             self._awake = True
             self._loop.call_soon(self._drain)
 
-    def _serve(self, shares: dict[Lane, int]) -> None:
-        """Serve one item after the other, always of the first lane that has items and share left."""
+    def _serve(self, shares: dict[PriorityClass, int]) -> None:
+        """Serve one item after the other, always of the highest priority that has items and share left."""
         lines = tuple(self._lines.items())
         while True:
-            for lane, line in lines:
-                if line and shares[lane]:
-                    shares[lane] -= 1
+            for priority, line in lines:
+                if line and shares[priority]:
+                    shares[priority] -= 1
                     self._serve_one(line)
                     break
             else:
@@ -112,33 +113,37 @@ class Source:
         self._inbox = inbox
         self._dropped = dropped
         self._folded = folded
-        self._queues = {lane: inbox.commands if lane is Lane.COMMAND else _Queue() for lane in Lane}
+        self._queues = {
+            priority: inbox.commands if priority is PriorityClass.COMMAND else _Queue() for priority in PriorityClass
+        }
 
     def __repr__(self) -> str:
-        waiting = ", ".join(f"{len(queue.items)} {lane.name}" for lane, queue in self._queues.items() if queue.items)
+        waiting = ", ".join(
+            f"{len(queue.items)} {priority.name}" for priority, queue in self._queues.items() if queue.items
+        )
         return f"<Source {waiting or 'empty'}>"
 
-    def put(self, raw: Any, lane: Lane, size: int = 0) -> None:
+    def put(self, raw: Any, priority: PriorityClass, size: int = 0) -> None:
         """Queue an item of ``size`` bytes for the loop, from any thread; drop and count the oldest where it is full."""
-        queue = self._queues[lane]
+        queue = self._queues[priority]
         while queue.items and (len(queue.items) >= QUEUE or queue.bytes + size > QUEUE_BYTES):
             queue.forget()
             self._dropped.value += 1
         queue.add(self, raw, size)
-        self._inbox.line_up(queue, lane)
+        self._inbox.line_up(queue, priority)
 
-    def fold(self, raw: Any, lane: Lane) -> None:
+    def fold(self, raw: Any, priority: PriorityClass) -> None:
         """Queue an item unless one waits already: then both are the same, and the new one is counted."""
-        queue = self._queues[lane]
+        queue = self._queues[priority]
         if queue.items:
             self._folded.value += 1
         else:
             queue.add(self, raw, 0)
-        self._inbox.line_up(queue, lane)
+        self._inbox.line_up(queue, priority)
 
 
 class _Queue:
-    """Items of one lane, of one source or of all. Each side counts bytes in numbers of its own, without a lock."""
+    """Items of one priority class, of one source or of all. Each side counts bytes of its own, without a lock."""
 
     def __init__(self) -> None:
         self.listed = False

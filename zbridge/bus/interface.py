@@ -152,8 +152,8 @@ Batch = Sequence[tuple[Publisher, list[bytes]]]
 """Stream messages of one read: for each key its payloads in order."""
 
 
-class Lane(IntEnum):
-    """Where input waits for the event loop, in the order of service; each lane has a bound and a share of its own.
+class PriorityClass(IntEnum):
+    """The order in which the event loop serves input; each class has a bound and a share of its own.
 
     STOP: stops that are all the same: of a source only one waits. LATCH: stops that have an id; each is served.
     """
@@ -164,14 +164,14 @@ class Lane(IntEnum):
     OTHER = 3
 
 
-Look = Callable[[], bytes]
+ReadPayload = Callable[[], bytes]
 """Returns the payload that an authorization proves: of a query, whose payload is the authorization, b""."""
-Sort = Callable[[str, bytes | None, int, Look], Lane | None]
-"""Chooses the lane of a sample or query; None: the sort has counted it, and it is dropped.
+Sort = Callable[[str, bytes | None, int, ReadPayload], PriorityClass | None]
+"""Chooses the priority class of a sample or query; None: the sort has counted it, and it is dropped.
 
 Runs on Zenoh's threads: must not block and must not raise. Arguments: the key (of a query the asked key expression),
-the attachment of a sample or the payload of a query, the bytes of payload and attachment together, and a look at the
-payload.
+the attachment of a sample or the payload of a query, the bytes of payload and attachment together, and a function
+that returns the payload.
 """
 
 
@@ -201,25 +201,26 @@ class Bus(Protocol):
         """
 
     def on_relief(self, handler: Callable[[], None]) -> None:
-        """Call ``handler`` when a paused source may go on."""
+        """Call ``handler`` when a paused source may resume."""
 
     def subscribe(
         self,
         key_expr: str,
         handler: Callable[[Sample], None],
         *,
-        lane: Lane | Sort = Lane.OTHER,
+        priority: PriorityClass | Sort = PriorityClass.OTHER,
         history: bool = False,
         kept: bool = False,
         direct: bool = False,
     ) -> Handle:
-        """Subscribe; samples come by a fixed lane or as a Sort chooses. history: ask for last values too.
+        """Subscribe to ``key_expr``.
 
+        priority: of all samples, or a Sort that chooses it for each. history: ask for last values too.
         kept: the frames that publishers have kept come too, those of publishers that appear later as well.
-        direct: the handler is called on one of Zenoh's threads, for streams without lane and history: it must be quick,
-        and may put frames on another bus.
+        direct: the handler is called on one of Zenoh's threads, for streams without priority and history: it must be
+        quick, and may put frames on another bus.
 
-        Of the samples that a Sort sends by the lane STOP only one waits at a time: those that follow are the same stop.
+        Of the samples that a Sort gives priority STOP only one waits at a time: those that follow are the same stop.
         """
 
     def answer(
@@ -227,7 +228,7 @@ class Bus(Protocol):
         key: str,
         handler: Callable[[IncomingQuery], None],
         *,
-        lane: Lane | Sort = Lane.OTHER,
+        priority: PriorityClass | Sort = PriorityClass.OTHER,
         complete: bool = False,
     ) -> Handle:
         """Answer queries that ask for ``key``, with or without wildcards; the last chunk of ``key`` may be one.

@@ -37,7 +37,7 @@ class Writer:
     """Makes calls in order, within :data:`BACKLOG`.
 
     lossless: ask to pause the source instead of dropping the oldest call. relieved: called on the writer's thread when
-    a paused source may go on. name: the label of the counters.
+    a paused source may resume. name: the label of the counters.
     """
 
     def __init__(self, name: str, metrics: Metrics, *, lossless: bool, relieved: Call) -> None:

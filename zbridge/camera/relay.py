@@ -1,6 +1,6 @@
 """Serves ``/stream.mjpg`` to HQ programs from the one stream that is fetched, as if this were the camera.
 
-Deployed programs read multipart naively. So they get what the camera itself wrote: its HTTP head, and of each picture
+Legacy programs read multipart naively. So they get what the camera itself wrote: its HTTP head, and of each picture
 the delimiter and header, byte for byte and in their order. Each client has a task of its own that sends the newest
 picture, waits until the socket has accepted it, and continues with the newest then: a slow client sees fewer pictures
 and delays nobody. Clients are accepted one by one, bounded in number; refused ones are closed at most 100 a second.

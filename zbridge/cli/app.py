@@ -60,7 +60,7 @@ SimulatedAt = Annotated[
     ),
 ]
 ServedBy = Annotated[
-    str, typer.Option(help="be an HQ program instead, as fragile as deployed ones, and connect to this address")
+    str, typer.Option(help="be an HQ program instead, as fragile as legacy ones, and connect to this address")
 ]
 Drives = Annotated[
     str, typer.Option(help="with --hq: drive FORWARD or FORWARD,TURN, fractions of full scale: 0.3 or 0.3,-0.2")
@@ -157,7 +157,7 @@ def simulate(
     version: Annotated[str, typer.Option(help="version of the protocol; the newest common one by default")] = "",
     dialect: Annotated[str, typer.Option(help="dialect of the protocol, where it has several")] = "",
     udp: Annotated[bool, typer.Option("--udp", help="offer datagrams")] = False,
-    fragile: Annotated[bool, typer.Option("--fragile", help="be as fragile as deployed robots")] = False,
+    fragile: Annotated[bool, typer.Option("--fragile", help="be as fragile as legacy robots")] = False,
     camera: Annotated[str, typer.Option(help="stream pictures too: HOST:PORT, for example 127.0.0.1:8000")] = "",
     verbose: Verbose = False,
 ) -> None:

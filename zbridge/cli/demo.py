@@ -135,7 +135,7 @@ async def run_demo(seconds: float, *, secure: bool = False) -> None:
 
 def _left_out(error: ZbridgeError) -> str:
     """Print why the demo continues without a protocol; return it."""
-    print(shown(f"zbridge: {error}; the demo goes on without it"), file=sys.stderr)  # noqa: T201
+    print(shown(f"zbridge: {error}; the demo continues without it"), file=sys.stderr)  # noqa: T201
     return str(error)
 
 

@@ -24,7 +24,7 @@ from zbridge.transport import Conversation, Link, connect
 PROBE_S = 15.0
 """Longest time a handshake may take."""
 WARNING = (
-    "{address} has no gateway on the bus. Deployed robots give one usable connection per start of the robot program: "
+    "{address} has no gateway on the bus. Legacy robots give one usable connection per start of the robot program: "
     "probing uses it up, and the robot must be restarted before a gateway can connect. Give --yes to probe."
 )
 

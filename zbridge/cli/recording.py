@@ -122,7 +122,7 @@ async def run_record(settings: BusSettings, options: RecordOptions) -> bool:
         finally:
             recording.close()
             await asyncio.to_thread(recorder.close)
-            _tell_end(recorder, tape, time.monotonic() - begun)
+            _report_end(recorder, tape, time.monotonic() - begun)
     return recorder.error is None
 
 
@@ -132,7 +132,7 @@ async def _until(full: asyncio.Event, duration_s: float | None) -> None:
             await full.wait()
 
 
-def _tell_end(recorder: Recorder, tape: Tape, seconds: float) -> None:
+def _report_end(recorder: Recorder, tape: Tape, seconds: float) -> None:
     if recorder.error is not None:
         errors.print(shown(recorder.error))
     files = ", ".join(map(str, tape.files[-3:]))
@@ -267,13 +267,13 @@ def _keys(player: Player) -> Iterator[None]:
             player.resume()
         else:
             player.pause()
-        errors.print("paused: Enter goes on" if player.paused else "playing: Enter pauses")
+        errors.print("paused: press Enter to resume" if player.paused else "playing: press Enter to pause")
 
     try:
         loop.add_reader(stdin, pressed)
     except OSError as error:
         raise ConfigError(f"pause: stdin cannot be read: {error.strerror}") from error
-    errors.print("paused: Enter goes on")
+    errors.print("paused: press Enter to resume")
     try:
         yield
     finally:

@@ -135,7 +135,7 @@ def replay(
     loop: Annotated[bool, typer.Option("--loop", help="begin anew at the end")] = False,
     since: Since = "",
     until: Until = "",
-    pause: Annotated[bool, typer.Option("--pause", help="wait; Enter goes on, and pauses again")] = False,
+    pause: Annotated[bool, typer.Option("--pause", help="start paused; Enter resumes, and pauses again")] = False,
     hq: HqListeners = None,
     as_robot: AsRobot = "",
     listen: Listen = None,

@@ -27,7 +27,7 @@ def supervise(paths: tuple[Path, ...], *, watch: bool, verbose: bool) -> None:
 
 
 def resume(descriptor: int, *, only_check: bool) -> None:
-    """Go on as a supervisor, in place of the code that left the state behind ``descriptor``.
+    """Continue as a supervisor, in place of the code that left the state behind ``descriptor``.
 
     only_check: end at once, with an error where the state cannot be taken. Raises HandoverError.
     """
@@ -58,7 +58,7 @@ def _forks() -> ForkClient:
 
 
 def _itself(paths: tuple[Path, ...], *, watch: bool, verbose: bool) -> list[str]:
-    """Give the command of the installed code that goes on in place of this one; the options are for those who look."""
+    """Return the command that runs the installed code in place of this one; its options show in process lists."""
     options = ["--watch"] * watch + ["--verbose"] * verbose
     return [*module_command("zbridge"), "run", *options, *map(str, paths)]
 

@@ -181,7 +181,7 @@ class Driver:
         """Get the lease.
 
         Raises Held if another program has it, Malformed if it cannot be asked for like this; after ``wait_s`` NotReady
-        or TooFast if the gateway went on saying so, BusError if none answered; BusRefused where that is because a
+        or RateLimited if the gateway kept refusing so, BusError if none answered; BusRefused where that is because a
         router knows this program by a role that may not drive.
         """
         self._holder.announce()

@@ -18,7 +18,7 @@ from collections.abc import Callable
 from contextlib import AbstractAsyncContextManager
 
 from zbridge.client.driver import Driver
-from zbridge.errors import BusError, LeaseLost, NeutralFirst, Refused, TooFast, ZbridgeError, describe
+from zbridge.errors import BusError, LeaseLost, NeutralFirst, RateLimited, Refused, ZbridgeError, describe
 from zbridge.fleet.messages import Drive
 from zbridge.lease.stick import Stick, StickAction
 
@@ -89,7 +89,7 @@ class Pilot:
     async def set_mode(self, mode: str) -> None:
         """Set who moves the robot, and keep the lease until the mode is none; raise Refused or BusError."""
         if self._setting >= MODES:
-            raise TooFast("too many changes of the mode at the same time")
+            raise RateLimited("too many changes of the mode at the same time")
         self._setting += 1
         self.stick.in_use = True
         self.take()
@@ -110,7 +110,7 @@ class Pilot:
             self._arm()
         self._send_waiting()
 
-    def hold_back(self, why: str) -> None:
+    def require_neutral(self, why: str) -> None:
         """Withdraw what waits; the stick must be centred once, for it was deflected before this."""
         self._waiting = None
         self.stick.refused(why)
@@ -193,7 +193,7 @@ class Pilot:
             self._end(error)
             return False
         if isinstance(error, NeutralFirst):
-            self.hold_back("motion was refused")
+            self.require_neutral("motion was refused")
         return True
 
     # Time

@@ -19,10 +19,10 @@ from collections.abc import Callable, Iterator
 import msgspec
 from msgspec import UNSET
 
-from zbridge.bus import Lane, Look
+from zbridge.bus import PriorityClass, ReadPayload
 from zbridge.control.authority import Authority
 from zbridge.control.latch import read_stop
-from zbridge.errors import Code, LeaseLost, Malformed, Refused, TooFast
+from zbridge.errors import Code, LeaseLost, Malformed, RateLimited, Refused
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, Mode, Motor, Raw
 from zbridge.fleet.topics import KeySpace
@@ -68,10 +68,10 @@ class RefusalLimit:
     def __repr__(self) -> str:
         return f"<RefusalLimit {sum(self._counted.values())} dropped>"
 
-    def lane(self, code: Code) -> Lane | None:
-        """Return the lane of a refused sample or query; None where it is only counted."""
+    def priority(self, code: Code) -> PriorityClass | None:
+        """Return the priority of a refused sample or query; None where it is only counted."""
         if self._allowance.take(self._clock()):
-            return Lane.OTHER
+            return PriorityClass.OTHER
         self._counted[code] += 1
         return None
 
@@ -114,27 +114,27 @@ class QueryFilter:
     def __repr__(self) -> str:
         return f"<QueryFilter {self.refusals!r}>"
 
-    def __call__(self, key: str, shown: bytes | None, size: int, read_payload: Look) -> Lane | None:
+    def __call__(self, key: str, shown: bytes | None, size: int, read_payload: ReadPayload) -> PriorityClass | None:
         """Return COMMAND if the proof shows the holder as the sender and the number is new."""
         holder = self._authority.holders.current
         if shown is None or holder is None or not (verifier := holder.verifier).plausible(shown):
-            return self.refusals.lane(Code.NO_LEASE)
+            return self.refusals.priority(Code.NO_LEASE)
         try:
             authorization = read(shown)
         except Malformed:
-            return self.refusals.lane(Code.MALFORMED)
+            return self.refusals.priority(Code.MALFORMED)
         if authorization.lease != verifier.lease:
-            return self.refusals.lane(Code.NO_LEASE)
+            return self.refusals.priority(Code.NO_LEASE)
         lease, seq = self._newest
         if authorization.lease == lease and authorization.seq <= seq:
-            return self.refusals.lane(Code.OUT_OF_ORDER)
+            return self.refusals.priority(Code.OUT_OF_ORDER)
         payload = read_payload()
         if not verifier.proves(authorization, key, payload):
-            return self.refusals.lane(Code.MALFORMED)
+            return self.refusals.priority(Code.MALFORMED)
         self._newest = (authorization.lease, authorization.seq)
         if self._notes:
             verifier.note(shown, authorization, key, payload)
-        return Lane.COMMAND
+        return PriorityClass.COMMAND
 
 
 class CommandFilter:
@@ -155,16 +155,16 @@ class CommandFilter:
     def __repr__(self) -> str:
         return f"<CommandFilter {self._keys.robot} {self.refusals!r}>"
 
-    def __call__(self, key: str, shown: bytes | None, size: int, read_payload: Look) -> Lane | None:
+    def __call__(self, key: str, shown: bytes | None, size: int, read_payload: ReadPayload) -> PriorityClass | None:
         kind = self._rules.get(key) or self._find(key)
         if kind.stop:
             return self._stop(read_payload() if size else b"")
         if size > kind.most_bytes:
-            return self.refusals.lane(Code.MALFORMED)
+            return self.refusals.priority(Code.MALFORMED)
         if kind.leased:
             return self._prover(key, shown, size, read_payload)
         if self._open.take(self._clock()):
-            return Lane.OTHER
+            return PriorityClass.OTHER
         self.refusals.count(Code.RATE)
         return None
 
@@ -172,7 +172,7 @@ class CommandFilter:
         """Note that a stop was carried out now; on the event loop's thread."""
         self._stopped_at = self._clock()
 
-    def _stop(self, payload: bytes) -> Lane | None:
+    def _stop(self, payload: bytes) -> PriorityClass | None:
         """Let a stop through unless it changes nothing. The holder is checked last: a new one may come meanwhile."""
         stop_id = read_stop(payload).id
         known = stop_id is UNSET or stop_id in self._authority.latches.stop_ids
@@ -180,7 +180,7 @@ class CommandFilter:
         if known and fresh and not self._authority.motion.moving and self._authority.verifier is None:
             self.same_stops += 1
             return None
-        return Lane.STOP if stop_id is UNSET else Lane.LATCH
+        return PriorityClass.STOP if stop_id is UNSET else PriorityClass.LATCH
 
     def _find(self, key: str) -> _CommandRule:
         kind = self._read(key)
@@ -209,7 +209,7 @@ class NameFilter:
     def __repr__(self) -> str:
         return f"<NameFilter {len(self._names)} names, {self.refusals!r}>"
 
-    def __call__(self, key: str, shown: bytes | None, size: int, read_payload: Look) -> Lane | None:
+    def __call__(self, key: str, shown: bytes | None, size: int, read_payload: ReadPayload) -> PriorityClass | None:
         now, name = self._clock(), key.rpartition("/")[2]
         own = self._names.get(name)
         if own is None:
@@ -219,7 +219,7 @@ class NameFilter:
         else:
             self._names.move_to_end(name)
         if own.take(now) and self._all.take(now):
-            return Lane.OTHER
+            return PriorityClass.OTHER
         self.refusals.count(Code.RATE)
         return None
 
@@ -228,6 +228,6 @@ _REFUSALS: dict[Code, Refused] = {
     Code.NO_LEASE: LeaseLost("no lease: acquire first", Code.NO_LEASE),
     Code.MALFORMED: Malformed("wrong proof, or too large"),
     Code.OUT_OF_ORDER: Malformed("repeated or out of order", Code.OUT_OF_ORDER),
-    Code.RATE: TooFast("too many a second"),
+    Code.RATE: RateLimited("too many a second"),
 }
 """The refusals that ``control`` shows for what was only counted."""

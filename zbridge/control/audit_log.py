@@ -6,7 +6,7 @@ Repeated events are folded, so that a flood neither fills the disk nor rotates o
 - An actor whose events differ has :data:`BURST` lines for each kind of event, then a share of one line a second. The
   rest of its events is counted together, as ``others``. Beyond :data:`ACTORS` actors at a time, new ones share one
   budget, because an actor may take any name. Each kind of event has its own budgets: no flood hides another kind.
-- Lines with counts have a budget too (:data:`COUNTS`); when it is used up, counting goes on and is written later.
+- Lines with counts have a budget too (:data:`COUNTS`); when it is used up, counting continues and is written later.
 
 A thread of its own writes the lines: a disk that hangs delays no stop. Lines that cannot be written wait, and the
 gateway's status says so.

@@ -6,9 +6,9 @@ authority makes inputs of what it is asked and told.
 Who calls what. The lease server calls :meth:`acquire`, :meth:`takeover`, :meth:`renew` and :meth:`release` for queries,
 and :meth:`vanished` for lost liveliness tokens. The enforcer calls :meth:`admit` for each command that needs the lease,
 :meth:`CommandedMotion.require_motion` if the command is motion, :meth:`applied` after the robot was sent it,
-:meth:`stop`, :meth:`hold_back`, and :meth:`expire` at :meth:`deadline`. After each call it takes :meth:`events`, writes
-each down, and sends the robot its stop at once for one that ``stops``. The admission filters read :attr:`verifier` and
-:attr:`motion` from the bus's threads; all else is for the event loop's thread.
+:meth:`stop`, :meth:`require_neutral`, and :meth:`expire` at :meth:`deadline`. After each call it takes :meth:`events`,
+writes each down, and sends the robot its stop at once for one that ``stops``. The admission filters read
+:attr:`holders` and :attr:`motion` from the bus's threads; all else is for the event loop's thread.
 
 Guarantees. Questions about the lease and :meth:`admit` do first what is due by then. Commanded motion always has a
 deadline. No lease ends while the robot moves without an event that stops it. Which program sent a command is decided by
@@ -125,8 +125,8 @@ class Authority:
         """Record that the holder's command for one part of the robot was carried out.
 
         given_at: when it was given, on the time line of ``now``; the deadman counts from then. A stale neutral ends
-        motion and does not allow it again. whole: a neutral counts for all parts; else a robot that was held back waits
-        for the neutral of each part that moved.
+        motion and does not allow it again. whole: a neutral counts for all parts; else a required
+        neutral must come for each part that moved.
         """
         given = self.motion.applied(part, given_at, moving=moving, stale=stale, whole=whole)
         if given is not None:
@@ -182,9 +182,9 @@ class Authority:
         if self.latches:
             self.machine.state = State.LATCHED
 
-    def hold_back(self, reason: str, *, stops: bool = True) -> None:
+    def require_neutral(self, reason: str, *, stops: bool = True) -> None:
         """Stop the robot, or (``stops=False``) record that it is stopped; motion needs a neutral first."""
-        self.machine.handle(Input.HOLD_BACK, Cause(reason=reason, stops=stops))
+        self.machine.handle(Input.REQUIRE_NEUTRAL, Cause(reason=reason, stops=stops))
 
     def vanished(self, alive: str) -> None:
         """Record that a liveliness token is gone; if the holder named it, the lease ends."""
@@ -244,4 +244,4 @@ class Authority:
 
 
 _ANOTHER_GATEWAY = "another gateway of the robot"
-_SHOWN = {State.MOVING: "held", State.HELD_BACK: "held"}
+_SHOWN = {State.MOVING: "held", State.NEEDS_NEUTRAL: "held"}

@@ -6,8 +6,8 @@ action that raises Refused has changed nothing, and the state stays.
 
 States. FREE and STOPPED: nobody has the lease (they differ in what people are shown). HELD: a program has the lease
 and no motion is commanded. MOVING: the last command for at least one part of the robot was motion; the deadman runs.
-HELD_BACK: a program has the lease and must send neutral before motion. LATCHED: a latched stop is in force; nobody has
-the lease, and nobody gets it.
+NEEDS_NEUTRAL: a program has the lease and must send neutral before motion. LATCHED: a latched stop is in force; nobody
+has the lease, and nobody gets it.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class AuthorityMachine:
         if self.holders.current is not None:
             self._end(Cause(reason=f"taken over by {who}"))
         elif self.motion.moving:
-            self._hold_back(Cause(reason=f"moving for nobody when {who} acquired"))
+            self._require_neutral(Cause(reason=f"moving for nobody when {who} acquired"))
         lease, token = self.holders.new_lease()
         verifier, self.motion.deadman_s = Verifier(lease, token), deadman_s
         age = CommandAge(min(self._max_age_s, deadman_s) if self._max_age_s < math.inf else math.inf)
@@ -123,13 +123,13 @@ class AuthorityMachine:
         """Stop the deadman; neutral also takes the robot out of its mode."""
         self.motion.rest()
 
-    def _hold_back(self, cause: Cause) -> None:
+    def _require_neutral(self, cause: Cause) -> None:
         """Require neutral before motion; report it once for each reason, and always with a stop."""
         motion, holder = self.motion, self.holders.current
-        if cause.stops or motion.moving or motion.held_back != cause.reason:
+        if cause.stops or motion.moving or motion.needs_neutral != cause.reason:
             who = holder.who if holder is not None else None
             self.events.append(Event(EventKind.STOPPED, who, cause.reason, stops=cause.stops))
-        motion.hold_back(cause.reason)
+        motion.require_neutral(cause.reason)
 
     def _end(self, cause: Cause) -> None:
         """End the lease, if there is one, and stop the robot if it moves, or if that was asked for."""
@@ -155,8 +155,8 @@ class AuthorityMachine:
         Input.MOTION: (_move, None),
         Input.NEUTRAL: (_rest, None),
         Input.STALE_NEUTRAL: (_rest_stale, None),
-        Input.DEADMAN: (_hold_back, None),
-        Input.HOLD_BACK: (_hold_back, None),
+        Input.DEADMAN: (_require_neutral, None),
+        Input.REQUIRE_NEUTRAL: (_require_neutral, None),
         Input.STOP: (_end, State.STOPPED),
         Input.LATCH: (_end, State.LATCHED),
     }
@@ -169,7 +169,7 @@ class AuthorityMachine:
         Input.RELEASE: (_give_back, State.FREE),
         Input.NEUTRAL: (_rest, State.HELD),
         Input.STALE_NEUTRAL: (_rest_stale, State.HELD),
-        Input.HOLD_BACK: (_hold_back, State.HELD_BACK),
+        Input.REQUIRE_NEUTRAL: (_require_neutral, State.NEEDS_NEUTRAL),
         Input.STOP: (_end, State.STOPPED),
         Input.LATCH: (_end, State.LATCHED),
         Input.EXPIRED: (_end, State.STOPPED),
@@ -180,12 +180,12 @@ class AuthorityMachine:
         State.FREE: _NOBODY,
         State.STOPPED: _NOBODY,
         State.HELD: _HOLDER | {Input.MOTION: (_move, State.MOVING)},
-        State.MOVING: _HOLDER | {Input.MOTION: (_move, None), Input.DEADMAN: (_hold_back, State.HELD_BACK)},
-        State.HELD_BACK: _HOLDER
+        State.MOVING: _HOLDER | {Input.MOTION: (_move, None), Input.DEADMAN: (_require_neutral, State.NEEDS_NEUTRAL)},
+        State.NEEDS_NEUTRAL: _HOLDER
         | {
             Input.MOTION: (_move, None),
             Input.STALE_NEUTRAL: (_rest_stale, None),
-            Input.DEADMAN: (_hold_back, None),
+            Input.DEADMAN: (_require_neutral, None),
         },
         State.LATCHED: _NOBODY
         | {

@@ -21,13 +21,13 @@ class CommandedMotion:
         """Whether the mode is autonomous; a stop and neutral end it."""
         self.on_its_own = False
         """Whether the robot may have moved by itself since its last stop: without a deadman, but every stop ends it."""
-        self.held_back: str | None = None
+        self.needs_neutral: str | None = None
         """Why neutral must come before motion; None: it need not."""
         self.moved: set[str] = set()
-        """The parts that moved when the robot was held back, and whose neutral has not come yet."""
+        """The parts that moved when neutral was required, and whose neutral has not come yet."""
 
     def __repr__(self) -> str:
-        return f"<CommandedMotion {sorted(self.parts)}, held back: {self.held_back}>"
+        return f"<CommandedMotion {sorted(self.parts)}, needs neutral: {self.needs_neutral}>"
 
     @property
     def moving(self) -> bool:
@@ -41,8 +41,8 @@ class CommandedMotion:
 
     def require_motion(self) -> None:
         """Raise Refused if the holder must send neutral before the robot moves."""
-        if self.held_back is not None:
-            raise NeutralFirst(f"{self.held_back}: send a neutral drive first")
+        if self.needs_neutral is not None:
+            raise NeutralFirst(f"{self.needs_neutral}: send a neutral drive first")
 
     def applied(self, part: str, given_at: float, *, moving: bool, stale: bool, whole: bool) -> Input | None:
         """Record a command that was carried out; return the input that follows from it, see :meth:`Authority.applied`.
@@ -53,7 +53,7 @@ class CommandedMotion:
         if moving and part in parts:  # repeated motion is no input: it only postpones the deadman
             self.stop_at = given_at + self.deadman_s
             return None
-        if not moving and not parts and self.held_back is None:  # nor is repeated neutral
+        if not moving and not parts and self.needs_neutral is None:  # nor is repeated neutral
             self.autonomous = False
             return None
         if not moving and not stale and self.moved:
@@ -83,11 +83,11 @@ class CommandedMotion:
         self.autonomous = False
         self.stop_at = math.inf
 
-    def hold_back(self, reason: str) -> None:
+    def require_neutral(self, reason: str) -> None:
         """Record that the robot is stopped, and require neutral before motion."""
         self.moved |= self.parts
         self._still()
-        self.held_back = reason
+        self.needs_neutral = reason
 
     def end(self) -> None:
         """Record that the robot is stopped, and that nobody drives it."""
@@ -96,7 +96,7 @@ class CommandedMotion:
 
     def allow(self) -> None:
         """Require no neutral before motion."""
-        self.held_back = None
+        self.needs_neutral = None
         self.moved.clear()
 
     def _still(self) -> None:

@@ -175,9 +175,9 @@ class Enforcer:
         self.authority.latches.autonomous = True
         return self._save(self.authority.latches)
 
-    def hold_back(self, reason: str, *, stops: bool) -> None:
+    def require_neutral(self, reason: str, *, stops: bool) -> None:
         """Allow no motion before a neutral drive; with ``stops`` the robot is sent its stop."""
-        self.authority.hold_back(reason, stops=stops)
+        self.authority.require_neutral(reason, stops=stops)
         self.settle()
 
     def bus_lost(self) -> None:

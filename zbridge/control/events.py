@@ -17,7 +17,7 @@ class AuthorityState(StrEnum):
     FREE = "free"
     HELD = "held"
     MOVING = "moving"
-    HELD_BACK = "held back"
+    NEEDS_NEUTRAL = "needs neutral"
     STOPPED = "stopped"
     LATCHED = "latched"
 
@@ -35,7 +35,7 @@ class AuthorityInput(StrEnum):
     NEUTRAL = "neutral carried out"
     STALE_NEUTRAL = "stale neutral carried out"
     DEADMAN = "deadman"
-    HOLD_BACK = "hold back"
+    REQUIRE_NEUTRAL = "require neutral"
     STOP = "stop"
     LATCH = "latch"
     UNLATCH = "last latch released"
@@ -62,7 +62,7 @@ class Cause(msgspec.Struct, frozen=True):
 
     at: when it happened, or when a command was given. received_ms: the gateway's raw clock. request: for the lease.
     shown, key: the proof of a question about the lease, and the key that was queried. kind, reason, who: of the event
-    that follows. stops: whether a hold-back sends the robot its stop.
+    that follows. stops: whether the robot is sent its stop where neutral is required.
     """
 
     at: float = math.inf

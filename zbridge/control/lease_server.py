@@ -12,7 +12,7 @@ from zbridge.bus import Handle, IncomingQuery
 from zbridge.control.admission import NameFilter, QueryFilter
 from zbridge.control.context import RobotContext
 from zbridge.control.enforcer import Enforcer
-from zbridge.errors import Code, Malformed, NotReady, PayloadError, Refused, TooFast
+from zbridge.errors import Code, Malformed, NotReady, PayloadError, RateLimited, Refused
 from zbridge.errors import refusal as refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -106,7 +106,7 @@ class LeaseServer:
             self._enforcer.settle()
 
         key = self._context.keys.key(f"@rpc/control/{name}")
-        return self._context.bus.answer(key, answer, lane=self._filters[command])
+        return self._context.bus.answer(key, answer, priority=self._filters[command])
 
     def _on_alive(self, key: str, alive: bool) -> None:
         if not alive:
@@ -121,7 +121,7 @@ class LeaseServer:
         self._require_latches()
         request = _request(query)
         if not self._takeovers.take(self._clock()):
-            raise TooFast(f"more than {TAKEOVERS_HZ:g} takeovers a second")
+            raise RateLimited(f"more than {TAKEOVERS_HZ:g} takeovers a second")
         return self._authority.takeover(request, self._clock(), self._context.raw_ms())
 
     def _renew(self, query: IncomingQuery) -> FleetMessage:
@@ -155,7 +155,7 @@ class LeaseServer:
         for each in reported:
             _require_own_name(query, each.who or "")
         if not self._reports.take(self._clock()):
-            raise TooFast(f"more than {REPORTS_HZ:g} tellings a second")
+            raise RateLimited(f"more than {REPORTS_HZ:g} tellings a second")
         for each in reported:
             count = min(max(each.count, 1), _COUNTED)
             self._authority.refuse(each.command, refused(each.code, each.reason), each.who, by=name, count=count)

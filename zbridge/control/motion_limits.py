@@ -6,7 +6,7 @@ import math
 
 import msgspec
 
-from zbridge.errors import TooFast
+from zbridge.errors import RateLimited
 from zbridge.fleet.messages import Drive
 
 STEP_S = 0.25
@@ -30,7 +30,7 @@ class MotionLimits:
         self._counted_at = -math.inf
 
     def limit(self, drive: Drive, now: float) -> Drive:
-        """Return the drive that may be sent now; raise TooFast if drives come too fast."""
+        """Return the drive that may be sent now; raise RateLimited if drives come too fast."""
         if not drive.moving:
             return drive
         if self.rate_hz < math.inf:
@@ -58,7 +58,7 @@ class MotionLimits:
         self._tokens = min(_BURST, self._tokens + (now - self._counted_at) * self.rate_hz)
         self._counted_at = now
         if self._tokens < 1:
-            raise TooFast(f"more than {self.rate_hz:g} commands a second")
+            raise RateLimited(f"more than {self.rate_hz:g} commands a second")
         self._tokens -= 1
 
 

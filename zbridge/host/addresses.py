@@ -24,12 +24,13 @@ import time
 from collections.abc import AsyncIterator, Iterable, Iterator, Mapping
 from hashlib import blake2b
 from pathlib import Path
+from typing import assert_never
 
 import msgspec
 
 from zbridge.app.config import GatewayPlan
 from zbridge.errors import ConfigError
-from zbridge.protocol.address import Address, DeviceAddress, SerialAddress
+from zbridge.protocol.address import Address, DeviceAddress, SerialAddress, ZenohAddress
 from zbridge.robot.settings import DevicePlan
 
 RESOLVE_S = 2.0
@@ -64,15 +65,20 @@ def resolve(addresses: Iterable[DeviceAddress], within_s: float = RESOLVE_S) -> 
     addresses = list(addresses)
     hosts = {address.host for address in addresses if isinstance(address, Address) and address.port}
     ips = _resolved(hosts, within_s)
-    return {address: _forms(address, ips) for address in addresses}
+    return {address: _lockable_forms(address, ips) for address in addresses}
 
 
-def _forms(address: DeviceAddress, ips: Mapping[str, frozenset[str]]) -> frozenset[str]:
-    if isinstance(address, SerialAddress):
-        return frozenset({f"serial {os.path.realpath(address.path)}"})
-    if not isinstance(address, Address) or not address.port:
-        return frozenset()
-    return frozenset(f"tcp {ip} {address.port}" for ip in ips[address.host])
+def _lockable_forms(address: DeviceAddress, ips: Mapping[str, frozenset[str]]) -> frozenset[str]:
+    match address:
+        case SerialAddress():
+            return frozenset({f"serial {os.path.realpath(address.path)}"})
+        case ZenohAddress():  # a router, to which many robots are connected
+            return frozenset()
+        case Address(port=0):  # any port
+            return frozenset()
+        case Address():
+            return frozenset(f"tcp {ip} {address.port}" for ip in ips[address.host])
+    assert_never(address)
 
 
 def _resolved(hosts: Iterable[str], within_s: float) -> dict[str, frozenset[str]]:

@@ -23,7 +23,7 @@ from zbridge.robot.observer import Boundary, LastStop
 log = logging.getLogger("zbridge.host")
 
 TIMES = 4
-"""So often a stop is written: deployed robots lose what they read together with something else."""
+"""So often a stop is written: legacy robots lose what they read together with something else."""
 PERIOD_S = 0.12
 """Seconds between two stops."""
 LEAVE_S = 0.5

@@ -142,7 +142,7 @@ class Runner:
         )
 
     def resume(self, state: RunnerState) -> None:
-        """Go on where the code before this one was; then call :meth:`run`."""
+        """Continue where the code before this one stopped; then call :meth:`run`."""
         self.restarts, self._restart_delay.failures, self._next_at = state.restarts, state.failures, state.next_at
         if state.process is not None:
             self.process = self._process(state.process.pid, FdChannel.inherited(state.process.channel), self.file)

@@ -32,7 +32,7 @@ class CommandQueue:
     """Puts commands on the bus, dated. Each is numbered when it is put, so none may overtake another.
 
     A drive is put at once. All other commands are written by a thread of the bus: the next command waits until the
-    bus has them. What waits longer than its sender means it is dropped. late: called when the queue goes on; returns
+    bus has them. What waits longer than its sender means it is dropped. late: called when the queue resumes; returns
     whether motion must not be sent any more.
     """
 

@@ -136,9 +136,9 @@ class Intent(Stick):
         """Return when the robot was last used: one that moves by itself is in use while anything is heard."""
         return max(self._used_at, self.heard_at) if self.mode == "autonomous" else self._used_at
 
-    def _hold_back(self, why: str) -> None:
+    def _require_neutral(self, why: str) -> None:
         """Demand a neutral that is said from now on."""
-        super()._hold_back(why)
+        super()._require_neutral(why)
         self._rests_at = math.inf
 
 

@@ -49,7 +49,7 @@ class ConnectionLog:
 
 
 class FailureLog:
-    """Counts and logs what a protocol could not show or understand, so that a listener goes on without it.
+    """Counts and logs what a protocol could not show or understand, so that a listener continues without it.
 
     A robot may be of a protocol that the listener's protocol has never met: ProtocolError and EncodeError are
     expected and logged at DEBUG. Anything else is a bug, logged once for each kind with its traceback.
@@ -71,7 +71,7 @@ class FailureLog:
             log.debug("%s: %s: %s", self._name, what, error)
         elif kind not in self._logged and len(self._logged) < FAILURES:
             self._logged.add(kind)
-            log.error("%s: %s: %r; going on without", self._name, what, error, exc_info=error)
+            log.error("%s: %s: %r; continuing without it", self._name, what, error, exc_info=error)
 
 
 class Folding:

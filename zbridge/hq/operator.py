@@ -13,7 +13,7 @@ import logging
 import math
 from collections.abc import Callable
 
-from zbridge.errors import Code, NotReady, TooFast, Unsupported
+from zbridge.errors import Code, NotReady, RateLimited, Unsupported
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Acquire, Control, Drive, FleetMessage, Mode, Motor, Raw, Refusal
 from zbridge.fleet.topics import Topic
@@ -101,7 +101,7 @@ class Operator:
             self._follow(self.intent.motion(now, lasts=False), topic, message)
         else:
             if not self._allowance.take(now):
-                raise TooFast(f"more than {OPEN_HZ:g} commands a second that need no lease")
+                raise RateLimited(f"more than {OPEN_HZ:g} commands a second that need no lease")
             self._open[topic.path.removeprefix("@cmd/")] = now
             self._bridge.put(topic, message)
 

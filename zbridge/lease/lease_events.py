@@ -9,7 +9,7 @@ from typing import TypeAlias
 import msgspec
 
 from zbridge.bus import Answer
-from zbridge.errors import BusError, NotReady, PayloadError, Refused, TooFast, ZbridgeError, refusal
+from zbridge.errors import BusError, NotReady, PayloadError, RateLimited, Refused, ZbridgeError, refusal
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import Control, Lease, Refusal
 
@@ -21,7 +21,7 @@ NAMED = 64
 """Characters of a name that are stored."""
 EXPLAINED = 200
 """Characters of a refusal's reason that are stored."""
-_PASSING: tuple[str, ...] = (*NotReady.codes, *TooFast.codes)
+_PASSING: tuple[str, ...] = (*NotReady.codes, *RateLimited.codes)
 """Codes that do not decide whose the lease is."""
 
 

@@ -62,7 +62,7 @@ class StickInput(StrEnum):
     GRANTED = "granted"
     LOST = "lost"
     RELEASED = "released"
-    HELD_BACK = "held back"
+    NEUTRAL_REQUIRED = "neutral required"
     CLEARED = "cleared"
 
 
@@ -148,7 +148,7 @@ class Stick:
 
     def lost(self, why: str) -> None:
         """Record that the lease was refused or has ended; neutral is needed."""
-        self._hold_back(why)
+        self._require_neutral(why)
         self._handle(StickInput.LOST)
 
     def released(self) -> None:
@@ -158,8 +158,8 @@ class Stick:
 
     def refused(self, why: str) -> None:
         """Record that motion was not, or must not be, carried out; neutral is needed."""
-        self._hold_back(why)
-        self._handle(StickInput.HELD_BACK)
+        self._require_neutral(why)
+        self._handle(StickInput.NEUTRAL_REQUIRED)
 
     def clear(self) -> None:
         """Record that neutral is not needed any more, though it was not said."""
@@ -202,7 +202,7 @@ class Stick:
     def _last_used(self) -> float:
         return self._used_at
 
-    def _hold_back(self, why: str) -> None:
+    def _require_neutral(self, why: str) -> None:
         """Demand a neutral that is said from now on."""
         self.needs_neutral, self._moving = why, False
 
@@ -235,20 +235,20 @@ class Stick:
             StickInput.MOTION: (StickAction.ACQUIRE, StickState.ASKING),
             StickInput.WANT: (StickAction.ACQUIRE, StickState.ASKING),
             StickInput.LOST: (StickAction.NOTHING, StickState.IDLE_NEEDS_NEUTRAL),
-            StickInput.HELD_BACK: (StickAction.NOTHING, StickState.IDLE_NEEDS_NEUTRAL),
+            StickInput.NEUTRAL_REQUIRED: (StickAction.NOTHING, StickState.IDLE_NEEDS_NEUTRAL),
         },
         StickState.ASKING: _WHILE_ASKING
         | {
             StickInput.MOTION: (StickAction.WAIT, None),
             StickInput.GRANTED: (StickAction.NOTHING, StickState.HOLDING),
             StickInput.RELEASED: (StickAction.NOTHING, StickState.IDLE),
-            StickInput.HELD_BACK: (StickAction.NOTHING, StickState.ASKING_NEEDS_NEUTRAL),
+            StickInput.NEUTRAL_REQUIRED: (StickAction.NOTHING, StickState.ASKING_NEEDS_NEUTRAL),
         },
         StickState.HOLDING: _WHILE_HOLDING
         | {
             StickInput.MOTION: (StickAction.SEND, None),
             StickInput.RELEASED: (StickAction.NOTHING, StickState.IDLE),
-            StickInput.HELD_BACK: (StickAction.NOTHING, StickState.HOLDING_NEEDS_NEUTRAL),
+            StickInput.NEUTRAL_REQUIRED: (StickAction.NOTHING, StickState.HOLDING_NEEDS_NEUTRAL),
         },
         StickState.IDLE_NEEDS_NEUTRAL: {
             StickInput.MOTION: (StickAction.REFUSE, None),

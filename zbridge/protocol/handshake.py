@@ -50,7 +50,7 @@ class Handshake(Kept, Generic[Step, Event]):
         return super().export(budget) | {"step": getattr(self.step, "name", self.step)}
 
     def restore(self, state: Exported) -> None:
-        """Go on from a step; raise ProtocolError if the table has none of that name."""
+        """Continue from a step; raise ProtocolError if the table has none of that name."""
         super().restore(state)
         steps = {getattr(step, "name", step): step for step in self._table}
         if state.get("step") not in steps:

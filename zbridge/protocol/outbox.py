@@ -16,7 +16,7 @@ Four places for frames. ``take`` looks at them in this order:
     queue    frames that are sent once (``put``).
 
 Fairness: the slot that has been due longest goes first; slots and queue take turns frame by frame, so that neither
-a stream of motion nor a full queue starves the other. A group that replaces one of the same length goes on at the
+a stream of motion nor a full queue starves the other. A group that replaces one of the same length continues at the
 position of the old one: if a group of motors is replaced faster than it is written, each motor still has its turn.
 
 Bounds: queue and exempt refuse a frame beyond ``limit``; urgent keeps the newest ``URGENT`` frames; a slot holds one

@@ -51,7 +51,7 @@ class RobotSide(Kept, ABC):
     hands_over: ClassVar[bool] = False
     """Whether this class and its sessions name in ``kept`` all that they must not lose when the gateway restarts."""
     closing_harmless: ClassVar[bool] = False
-    """Whether a robot with two connections obeys the other one as before when one is closed; most deployed do not."""
+    """Whether a robot with two connections obeys one as before when the other is closed; most legacy ones do not."""
     link_names: tuple[str, ...]
     """One name for each configured address, in the order of the configuration; the first link drives the robot."""
 
@@ -223,15 +223,15 @@ class HqSide(Kept, ABC):
         return command.moving
 
     def attend(self, client: RobotUser) -> None:
-        """Look after a client that holds the robot; called every :data:`ATTEND_S`.
+        """ReadPayload after a client that holds the robot; called every :data:`ATTEND_S`.
 
-        Deployed programs repeat their motion, or the deadman ends it. For those that set it once, override this.
+        Legacy programs repeat their motion, or the deadman ends it. For those that set it once, override this.
         """
         return
 
 
 class HqSimulation(msgspec.Struct, frozen=True):
-    """How a simulated HQ program is started. It is as fragile as deployed ones. ``address``: where it connects.
+    """How a simulated HQ program is started. It is as fragile as legacy ones. ``address``: where it connects.
 
     ``drive``: forward and turn that it drives once it has sent neutral, fractions of full scale; None: none.
     """

@@ -118,7 +118,7 @@ class Session(KeptSession, ABC, Generic[M]):
         """React to a second source, or session, with the same claim; the peer has no source of datagrams any more."""
 
     def stray(self, datagram: bytes) -> None:
-        """Look at a datagram of the peer's host that nobody claimed; raise Refused to tell the peer why."""
+        """ReadPayload at a datagram of the peer's host that nobody claimed; raise Refused to tell the peer why."""
 
     def timers(self) -> float:
         """Give the time of the next :meth:`on_timer`; ``inf``: never."""

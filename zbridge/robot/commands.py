@@ -170,7 +170,7 @@ class Commands:
                 _require_sure(session)
         except Refused as refusal:
             if moving:
-                self._enforcer.hold_back(str(refusal), stops=False)
+                self._enforcer.require_neutral(str(refusal), stops=False)
             raise
         if moving:
             permitted = self._enforcer.permit(command, now)

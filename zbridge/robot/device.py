@@ -220,7 +220,7 @@ class Device(Transferable):
         self._on_demand = self._on_demand or self._telemetry.serve()
         self._commanded = self._commanded or [
             *self._leases.serve(),
-            context.bus.subscribe(context.keys.key("@cmd/**"), self._commands.take, lane=self._enforcer.admission),
+            context.bus.subscribe(context.keys.key("@cmd/**"), self._commands.take, priority=self._enforcer.admission),
             *self._queries.serve(),
         ]
 

@@ -71,7 +71,7 @@ class Served(Protocol):
         """Take what a gateway knows that does not serve the robot."""
 
     async def step_aside(self) -> None:
-        """Leave the robot to another gateway, and stay connected."""
+        """Leave the robot to another gateway: stop it, then publish, write and connect nothing."""
 
     async def step_in(self) -> None:
         """Serve the robot again."""
@@ -192,6 +192,7 @@ class Ownership:
         if found is OwnershipInput.OUTBID and self._keeps_latches(own):
             return state
         if self._handle(found) is OwnershipState.LOOKING:
+            await served.step_aside()
             return self._state
         if self._state is not state:
             log.error("%s: %s", self._robot, _TURNS[self._state])

@@ -72,9 +72,9 @@ class Presence:
         elif session.state is State.ESTABLISHED and session is not self._greeted:
             self._on_established(session)
         elif busy != self._busy:
-            self._enforcer.hold_back(self._busy or "no longer busy", stops=True)
+            self._enforcer.require_neutral(self._busy or "no longer busy", stops=True)
         if self._doubtful and not doubtful:
-            self._enforcer.hold_back(self._doubtful, stops=True)
+            self._enforcer.require_neutral(self._doubtful, stops=True)
         if session.doubts != self._shown_doubts and not session.over and self._links.first.state == "established":
             self.publish_status()
 
@@ -88,7 +88,7 @@ class Presence:
             self._stalls.value += 1
             log.warning("%s: %s", self._context.keys.robot, LINK_BLOCKED)
         else:
-            self._enforcer.hold_back("the robot's link took nothing", stops=True)
+            self._enforcer.require_neutral("the robot's link took nothing", stops=True)
 
     def publish_status(self) -> None:
         """Publish ``status`` as it is now."""
@@ -118,7 +118,7 @@ class Presence:
         if session.version is not None:
             self._lost.value += len(session.outbox)
             if not self._leaving:
-                self._enforcer.hold_back("robot lost", stops=False)
+                self._enforcer.require_neutral("robot lost", stops=False)
             self._pending.refuse_all("the robot was lost")
 
     def _on_established(self, session: Session[Any]) -> None:

@@ -22,7 +22,7 @@ log = logging.getLogger("zbridge.link")
 FIRST = 16
 """First frames of a conversation that are kept, also where there is no handshake."""
 KEPT = 64
-"""Most frames that are kept while the handshake goes on."""
+"""Most frames that are kept during the handshake."""
 KEPT_BYTES = 65_536
 """Bytes that are kept."""
 SETTLE_S = 0.02

@@ -1,4 +1,4 @@
-"""A robot's camera to play with: streams drawn JPEGs as deployed robots do, MJPEG by HTTP at ``/stream.mjpg``."""
+"""A robot's camera to play with: streams drawn JPEGs as legacy robots do, MJPEG by HTTP at ``/stream.mjpg``."""
 
 from __future__ import annotations
 

@@ -65,7 +65,7 @@ def _at(
             for problem in go_wrong(rehearsal, [noise, *recording.received[step : step + 3]]):
                 yield f"after {step} frames: {problem}"
     except Exception as error:  # whatever the protocol's own code raises is a finding
-        yield f"after {step} frames: {raised(error, 'a session that goes on, or Session.fail with a reason')}"
+        yield f"after {step} frames: {raised(error, 'a session that continues, or Session.fail with a reason')}"
 
 
 def _garbage(rehearsal: Rehearsal, frames: list[bytes]) -> Iterator[str]:

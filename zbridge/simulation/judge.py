@@ -1,7 +1,7 @@
 """What every judge records: violations, events and the cause of its death. Sans-IO; knows no protocol.
 
-A judge is a simulated peer as fragile as the deployed ones: it records each violation of what the page of its protocol
-demands, and dies of what kills or cripples the deployed programs. Section names in its docstrings are those of that
+A judge is a simulated peer as fragile as the legacy ones: it records each violation of what the page of its protocol
+demands, and dies of what kills or cripples the legacy programs. Section names in its docstrings are those of that
 page. Judges share their scaffold (this module, ``fragile``, ``hq_program``, ``sockets`` and ``timing``), and no code
 with the gateway that they judge, so that an error there cannot hide here: not its messages, session or translation.
 """
@@ -54,7 +54,7 @@ class Judge:
             self.events.append(text)
 
     def _die(self, text: str) -> NoReturn:
-        """Record a violation that kills a deployed program; raise Ended."""
+        """Record a violation that kills a legacy program; raise Ended."""
         self.alive, self.death = False, text
         self._violate(text)
         raise Ended(f"died: {text}")

@@ -69,6 +69,6 @@ class Accepted(Receiver):
             self._conversation.foreign_datagram()
 
     def writable(self) -> None:
-        """Go on writing."""
+        """Resume writing."""
         if self._conversation is not None:
             self._conversation.writable()

@@ -214,7 +214,7 @@ class Conversation:
             self._fault(error)
 
     def writable(self) -> None:
-        """Go on writing."""
+        """Resume writing."""
         self.pump()
 
     def _pump(self) -> None:
@@ -325,7 +325,7 @@ class Conversation:
             self._link.suspend()
 
     def resume(self) -> None:
-        """Go on where :meth:`suspend` interrupted: this process has the connection."""
+        """Continue where :meth:`suspend` interrupted: this process has the connection."""
         self.suspended = False
         if self._link is not None:
             self._link.resume()

@@ -35,7 +35,7 @@ class Receiver(Protocol):
         """React to a second source, or a second receiver, with the same claim: the peer has no source any more."""
 
     def stray_datagram(self, datagram: bytes) -> None:
-        """Look at a datagram of the peer's host that nobody claimed; the link has dropped it."""
+        """ReadPayload at a datagram of the peer's host that nobody claimed; the link has dropped it."""
 
     def foreign_datagram(self) -> None:
         """Count a datagram from elsewhere; the link has dropped it."""
@@ -44,7 +44,7 @@ class Receiver(Protocol):
         """End: the connection is gone. Called once, after every other method."""
 
     def writable(self) -> None:
-        """Go on writing: ``ready`` is True again."""
+        """Resume writing: ``ready`` is True again."""
 
 
 class Link(Protocol):

@@ -44,7 +44,7 @@ class Reading:
     def resume(self) -> None:
         """Read again."""
         self._paused = False
-        self._go_on()
+        self._resume()
 
     def worked(self, begun: float) -> None:
         """Note work for the link that began at ``begun`` and ends now; rest where it was more than the share."""
@@ -66,8 +66,8 @@ class Reading:
     def _rested(self) -> None:
         self._rests = None
         if not self._paused:
-            self._go_on()
+            self._resume()
 
-    def _go_on(self) -> None:
+    def _resume(self) -> None:
         if self.link is not None and self._rests is None and not self.suspended:
             self.link.resume_reading()

@@ -15,7 +15,7 @@ import contextlib
 import time
 from collections.abc import AsyncIterator, Callable
 
-from zbridge.bus import Bus, BusSettings, Handle, Lane, Look, Publisher, Sample, Sort, open_bus
+from zbridge.bus import Bus, BusSettings, Handle, PriorityClass, Publisher, ReadPayload, Sample, Sort, open_bus
 from zbridge.errors import BusError, LinkError, NotReady
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address, ZenohAddress
@@ -147,7 +147,7 @@ class ZenohLink:
             return self._bus.announce(sample.key)
         if sample.kind is SampleKind.WATCH:
             return self._bus.watch_alive(sample.key, self._on_token)
-        return self._bus.subscribe(sample.key, self._on_sample, lane=self._sort(), kept=bool(sample.payload))
+        return self._bus.subscribe(sample.key, self._on_sample, priority=self._sort(), kept=bool(sample.payload))
 
     def _publisher(self, key: str, kind: SampleKind) -> Publisher:
         publisher = self._publishers.get(key)
@@ -164,9 +164,9 @@ class ZenohLink:
         """Make what drops, on Zenoh's threads, the samples of one subscription that come too fast."""
         limit, clock = RateLimit(RATE_HZ), time.monotonic
 
-        def sort(key: str, shown: bytes | None, size: int, look: Look) -> Lane | None:
+        def sort(key: str, shown: bytes | None, size: int, read_payload: ReadPayload) -> PriorityClass | None:
             if limit.take(clock()):
-                return Lane.OTHER
+                return PriorityClass.OTHER
             self._above += 1
             return None
 

@@ -191,7 +191,7 @@ class SerialLink:
                 self._receiver.writable()
 
     def _close_when_sent(self) -> None:
-        """Look until the output queue is empty, or time is up: the kernel itself would block in ``close``."""
+        """ReadPayload until the output queue is empty, or time is up: the kernel itself would block in ``close``."""
         if not self._open or self._close_by is None:
             return
         if self._unsent() and self._loop.time() < self._close_by:

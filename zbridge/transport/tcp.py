@@ -37,7 +37,7 @@ CLIENT_READ_BYTES = 4096
 CLIENT_WRITE_BYTES = 64 * 1024
 """Bytes that the kernel keeps for an accepted peer that reads slowly; older ones are of no use."""
 GIVE_UP_S = 60.0
-"""Seconds without acknowledgement after which a robot's connection ends: long, for a deployed robot gives only one."""
+"""Seconds without acknowledgement after which a robot's connection ends: long, for a legacy robot gives only one."""
 CLIENT_GIVE_UP_S = 10.0
 """The same for an accepted peer."""
 _TCP_INFO = struct.Struct("=24xI28xI")
@@ -81,7 +81,7 @@ class TcpLink(asyncio.BufferedProtocol):
         self._receiver = receiver
         self._transport: asyncio.Transport | None = None
         self._view = memoryview(bytearray(READ_BYTES) if buffer is None else buffer)
-        self._held_back = False
+        self._writing_paused = False
 
     def __repr__(self) -> str:
         return f"<TcpLink {self.peer or 'unconnected'}>"
@@ -98,7 +98,7 @@ class TcpLink(asyncio.BufferedProtocol):
     @property
     def ready(self) -> bool:
         """Whether the kernel took all that was written."""
-        return self._transport is not None and not self._held_back
+        return self._transport is not None and not self._writing_paused
 
     def write(self, data: bytes) -> None:
         """Write ``data`` as one segment."""
@@ -197,7 +197,7 @@ class TcpLink(asyncio.BufferedProtocol):
         transport = self._transport
         if transport is not None and not transport.is_closing():
             transport.close()
-            if self._held_back:
+            if self._writing_paused:
                 asyncio.get_running_loop().call_later(CLOSE_S, self.abort)
 
     def abort(self) -> None:
@@ -253,10 +253,10 @@ class TcpLink(asyncio.BufferedProtocol):
         return False
 
     def pause_writing(self) -> None:
-        self._held_back = True
+        self._writing_paused = True
 
     def resume_writing(self) -> None:
-        self._held_back = False
+        self._writing_paused = False
         self._receiver.writable()
 
     def connection_lost(self, exc: Exception | None) -> None:

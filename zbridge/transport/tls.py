@@ -184,7 +184,7 @@ class TlsLink(Receiver):
         self._receiver.lost(self._why or reason)
 
     def writable(self) -> None:
-        """Go on writing."""
+        """Resume writing."""
         if self._open:
             self._receiver.writable()
 

@@ -23,7 +23,7 @@ _DIGITS = b"0123456789"
 _UNCLIPPED = 2**63 - 2
 """The largest number of a row that is surely not a larger one, clipped by numpy."""
 _MOST = 2**31 - 1
-"""The largest number of an array: deployed readers hold 32 bits."""
+"""The largest number of an array: legacy readers hold 32 bits."""
 
 
 class TextCodec(Generic[M]):

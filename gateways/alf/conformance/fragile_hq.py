@@ -1,4 +1,4 @@
-"""A simulated ALF operator program as fragile as the deployed ones: the judge of a gateway that plays the vehicle."""
+"""A simulated ALF operator program as fragile as the legacy ones: the judge of a gateway that plays the vehicle."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ from zbridge.simulation.timing import Ticker
 Serves = Literal["auto", "drive", "laser", "both"]
 """What the gateway's listener is configured to serve ("The gateway as vehicle")."""
 Deployed = Literal["driving", "scanning"]
-"""Which of the deployed programs; none tolerates both kinds of messages ("The gateway as vehicle")."""
+"""Which of the legacy programs; none tolerates both kinds of messages ("The gateway as vehicle")."""
 
 _SERVED = {"drive": (INFO, END), "laser": (INIT, SCAN, END), "both": (INIT, SCAN, INFO, END)}
 _MOST_SCANS = 10
-"""Measurements after which the deployed driving program stops reading."""
+"""Measurements after which the legacy driving program stops reading."""
 FULL = {"text": 255, "binary": 100}
 """The speed that is full speed."""
 

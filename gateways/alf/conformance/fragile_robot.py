@@ -1,4 +1,4 @@
-"""A simulated ALF vehicle as fragile as the deployed ones: the judge of a gateway that plays HQ."""
+"""A simulated ALF vehicle as fragile as the legacy ones: the judge of a gateway that plays HQ."""
 
 from __future__ import annotations
 

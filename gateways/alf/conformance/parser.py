@@ -29,7 +29,7 @@ FULL_PERCENT = 100
 """Speed that is full speed; a vehicle takes more without clamping in ``text``, as 100 in ``binary``."""
 MAX_INT = 2**31 - 1
 NUMBER = re.compile(r"-?[0-9]*\.?[0-9]+")
-"""What deployed readers take as a field ("Dialect `text`")."""
+"""What legacy readers take as a field ("Dialect `text`")."""
 INTEGERS = re.compile(rb"(0|-?[1-9][0-9]*)(\|(0|-?[1-9][0-9]*))*;")
 """A message of integers, as std::to_string prints them."""
 
@@ -158,7 +158,7 @@ class _AlfReader(MessageReader[ParsedAlfMessage]):
         return self._judge(kind, tuple(fields), raw)
 
     def _read_text(self, raw: bytes) -> ParsedAlfMessage:
-        """Read a message as deployed readers do: every number is a field, all else separates ("Dialect `text`")."""
+        """Read a message as legacy readers do: every number is a field, all else separates ("Dialect `text`")."""
         raise NotImplementedError
 
     def _judge(self, kind: int, fields: Fields, raw: bytes) -> ParsedAlfMessage:

@@ -1,4 +1,4 @@
-"""A simulated HQ program as fragile as the deployed ones: the judge of a gateway that plays robot."""
+"""A simulated HQ program as fragile as the legacy ones: the judge of a gateway that plays robot."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from zbridge.simulation.timing import STAMPED, Read, ReadingThread
 _SMALLEST_READ = 6
 _WAITING = 1000
 DEPLOYED_PORT = 11000
-"""The UDP port that deployed programs bind ("Handshake", Ports)."""
+"""The UDP port that legacy programs bind ("Handshake", Ports)."""
 
 
 class _HqPhase(enum.Enum):
@@ -37,7 +37,7 @@ class _HqPhase(enum.Enum):
 
 
 class HqTimes(msgspec.Struct, frozen=True, kw_only=True):
-    """The HQ's times in seconds; the defaults are those of the deployed HQ programs."""
+    """The HQ's times in seconds; the defaults are those of the legacy HQ programs."""
 
     answer_s: float = 0.015
     """From packet 2 to the answer 3 (as captured)."""
@@ -56,7 +56,7 @@ class FragileTcpUdpHq(OperatorProgram):
     ``lidar_sim``: announce LidarSim; ``skips_map_flag``: read the map's size where the SLAMMap flag is;
     ``unasked``: a 1.1 program has handlers for 53 and 55 before it asked, unlike the first programs of 1.1;
     ``repeat_s``: seconds between repetitions of the stick, None for a viewer that sends nothing by itself;
-    ``udp_port``: the port to bind, 0 for any; None: the deployed one, or any if that is taken. A row of ``received``:
+    ``udp_port``: the port to bind, 0 for any; None: the legacy one, or any if that is taken. A row of ``received``:
     monotonic seconds, channel, id, body.
     """
 
@@ -91,7 +91,7 @@ class FragileTcpUdpHq(OperatorProgram):
         self._asked: set[int] = set()
         self._repeat_s, self._udp_port, self._times = repeat_s, udp_port, times
         self._phase = _HqPhase.CONNECTED
-        self._reads = wire.Reads(wire.HQ_LOSES_BYTES - 1)
+        self._reads = wire.ReadChecker(wire.HQ_LOSES_BYTES - 1)
         self._inbox: asyncio.Queue[tuple[Channel, Read]] = asyncio.Queue(_WAITING)
         self._robot: tuple[str, int] = ("", 0)
         self._udp: socket.socket | None = None
@@ -214,7 +214,7 @@ class FragileTcpUdpHq(OperatorProgram):
         if len(read.data) < _SMALLEST_READ:
             self._violate(f"a read of {len(read.data)} bytes, taken as a disconnect: {show(read.data)}")
             raise Ended("hung up: took a short read as a disconnect")
-        received, problem = self._reads.take(read.data)
+        received, problem = self._reads.check(read.data)
         late = f" (this process read {read.late_s * 1000:.0f} ms late)"
         if self._reads.hopeless:
             self._die(problem)

@@ -1,4 +1,4 @@
-"""A simulated TCP/UDP robot as fragile as the deployed ones: the judge of a gateway that plays HQ."""
+"""A simulated TCP/UDP robot as fragile as the legacy ones: the judge of a gateway that plays HQ."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class FragileRobot(FragileServer):
         self._forget()
 
     def _forget(self) -> None:
-        self._reads = wire.Reads()
+        self._reads = wire.ReadChecker()
         self._ignores_next = False
         self._awake = asyncio.Event()
         self._hq_features: frozenset[FeatureFlag] = frozenset()
@@ -144,7 +144,7 @@ class FragileRobot(FragileServer):
         Joined packets are the HQ's fault if they came in less time, since a poll found nothing, than correctly spaced
         packets need; the text says how long this process did not read if it may be at fault itself.
         """
-        received, problem = self._reads.take(data)
+        received, problem = self._reads.check(data)
         joined, unread_s = self._reads.joined, self._polling.unread_s
         if joined and unread_s >= self._times.gap_s * (len(joined) - 1):
             problem += f" (this process read nothing for {unread_s * 1000:.0f} ms)"
@@ -355,7 +355,7 @@ class FragileRobot(FragileServer):
     # Motion, maps, talk
 
     async def _move(self) -> None:
-        """Move as commanded, for ever: a deployed robot does not stop by itself."""
+        """Move as commanded, for ever: a legacy robot does not stop by itself."""
         ticker = Ticker(_STEP_S)
         while True:
             await ticker.tick()

@@ -65,7 +65,7 @@ IGNORE_ONE = frozenset({"1.1", "1.2"})
 
 
 class RobotTimes(msgspec.Struct, frozen=True, kw_only=True):
-    """The robot's times in seconds; the defaults are those of the deployed robots."""
+    """The robot's times in seconds; the defaults are those of the legacy robots."""
 
     read_s: float = 0.005
     """Longest sleep between two reads."""
@@ -146,8 +146,8 @@ def cut(data: bytes) -> tuple[list[ParsedPacket], bytes, bool]:
     return packets, data, False
 
 
-class Reads:
-    """The reads of one TCP connection: each must be exactly one packet ("The gateway as HQ")."""
+class ReadChecker:
+    """Checks the reads of one TCP connection: each must be exactly one packet ("The gateway as HQ")."""
 
     def __init__(self, most: int = READ_BYTES) -> None:
         self.joined: list[ParsedPacket] = []
@@ -157,8 +157,8 @@ class Reads:
         self._tail = b""
         self._most = most
 
-    def take(self, data: bytes) -> tuple[ParsedPacket | None, str]:
-        """Give the packet that one read is, or what is wrong with it; neither for the rest of a split packet."""
+    def check(self, data: bytes) -> tuple[ParsedPacket | None, str]:
+        """Return the packet of one read, or what is wrong with the read; neither for the rest of a split packet."""
         late = bool(self._tail)
         packets, self._tail, self.hopeless = cut(self._tail + data)
         self.joined = packets if len(packets) > 1 and not self._tail else []

@@ -23,7 +23,7 @@ from gateways.tcpudp.settings import ROBOT_BLOCKS, SETTINGS, VERSIONS, Feature, 
 from zbridge.protocol import Datagram, Handshake, Kept, Limits, ProtocolError, Role, Traffic, agree, parse_versions
 
 FIRST_CLIENT = 2
-"""The id that most robots give their first client; a deployed one gave 35."""
+"""The id that most robots give their first client; a legacy one gave 35."""
 INSPECT_S = 5.0
 """Seconds after which a silent connection is a sign."""
 INSPECT_AGAIN_S = 1.0

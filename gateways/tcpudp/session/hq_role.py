@@ -20,7 +20,7 @@ from gateways.tcpudp.settings import ANNOUNCED, Feature
 from zbridge.protocol import FRAME, FRAMES, LIMIT, EncodeError, Frame, Limits, Malformed, Spare, Unsupported
 
 MAX_WRITE = 4096
-"""Bytes of the longest packet a deployed robot reads whole."""
+"""Bytes of the longest packet a legacy robot reads whole."""
 AGAIN_S = 0.3
 """Seconds after which a mode or a lidar mode is sent again to robots that misread a tenth of what they get."""
 _AUTONOMOUS = 3

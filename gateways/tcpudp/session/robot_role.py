@@ -14,7 +14,7 @@ client's source in two ways only:
 
 - by a 5 between our 4 and its 7 (:meth:`ClientSource.claims_probe`). If a second port sends a 5 too, the session
   accepts datagrams of neither;
-- after the handshake, while the client has no source, by a packet with its id from the port that deployed programs bind
+- after the handshake, while the client has no source, by a packet with its id from the port that legacy programs bind
   (:meth:`ClientSource.claims_late`): a program of 1.3 whose 5 was lost sends 11, 12 and 61 by UDP all the same. If it
   has another source then, one of the two is not the client, and the session no longer accepts datagrams of either.
 
@@ -50,7 +50,7 @@ from zbridge.protocol import (
 )
 
 CLIENT_PORT = 11000
-"""The UDP port that deployed HQ programs bind."""
+"""The UDP port that legacy HQ programs bind."""
 FROM_HQ: dict[int, Decode] = decoders(Role.ROBOT)
 """How to read what an HQ program may send, by packet id."""
 _UNASSIGNED = (0, packets.SERVER_ID)

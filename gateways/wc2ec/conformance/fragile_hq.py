@@ -1,4 +1,4 @@
-"""A simulated external controller as fragile as the deployed ones: the judge of a gateway that plays Webots."""
+"""A simulated external controller as fragile as the legacy ones: the judge of a gateway that plays Webots."""
 
 from __future__ import annotations
 

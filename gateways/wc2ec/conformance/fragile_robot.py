@@ -1,4 +1,4 @@
-"""A simulated Webots controller as fragile as the deployed ones: the judge of a gateway that plays the external one."""
+"""A simulated Webots controller as fragile as the legacy ones: the judge of a gateway that plays the external one."""
 
 from __future__ import annotations
 

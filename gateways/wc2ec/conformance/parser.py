@@ -36,7 +36,7 @@ _COMMANDS = {"deployed": (SET_VALUE,), "draft": (ENABLE, DISABLE, CHANGE, SET)}
 
 
 class DeviceKind(enum.Enum):
-    """What a device is for the deployed controller, whatever its Webots node type ("the numbers move")."""
+    """What a device is for the legacy controller, whatever its Webots node type ("the numbers move")."""
 
     DISTANCE = enum.auto()
     LIGHT = enum.auto()

@@ -166,7 +166,7 @@ async def test_a_gateway_that_ends_meanwhile_takes_everything_back_first(scene: 
     with pytest.raises(NotReady, match="the gateway ends"):
         await running
     assert scene.steps == ["prepare", "shut", "suspend", "withdraw", "resume"]
-    assert scene.successor.process.wait(SOON_S) == -signal.SIGKILL, "before it goes on"
+    assert scene.successor.process.wait(SOON_S) == -signal.SIGKILL, "before it continues"
 
 
 async def test_a_gateway_that_ends_before_its_successor_says_hello_waits_for_nothing(scene: Scene) -> None:
@@ -198,7 +198,7 @@ async def test_without_the_supervisors_ear_nothing_is_handed_over(scene: Scene) 
     with pytest.raises(NotReady, match="does not listen"):
         await running
     assert scene.steps[-1] == "resume"
-    assert scene.successor.process.wait(SOON_S) == -signal.SIGKILL, "before it goes on"
+    assert scene.successor.process.wait(SOON_S) == -signal.SIGKILL, "before it continues"
 
 
 async def test_a_successor_of_another_version_is_told_and_nothing_has_changed(scene: Scene) -> None:

@@ -12,7 +12,7 @@ While the robot moves, its gateway
 hung: blocks its event loop for good; frozen: is stopped (SIGSTOP); killed: is killed (SIGKILL);
 restart: is restarted, and both processes come through;
 predecessor, successor: is restarted, and this process dies, or is frozen, at this step (:mod:`tests.e2e.rigs.steps`);
-again: is killed, and so is the process that goes on with its connections, at this step.
+again: is killed, and so is the process that continues with its connections, at this step.
 
 The time to rest runs from that moment; where the driver may drive on (the successor died early), from the driver's end.
 Then the robot is driven again. Its judge must have nothing to say, and must have seen one connection. The HQ program
@@ -77,7 +77,7 @@ MAPS: dict[str, dict[str, Any]] = {
 """The robots that are measured, and their maps: cells along a side."""
 CRASHES = {"hung": signal.SIGUSR1, "frozen": signal.SIGSTOP, "killed": signal.SIGKILL}
 EARLY = (steps.BEFORE_HELLO, steps.AFTER_HELLO, steps.AFTER_GIVEN, steps.AFTER_UP)
-"""A successor that dies at one of these has not got the robot: the gateway goes on."""
+"""A successor that dies at one of these has not got the robot: the gateway continues."""
 _numbers = itertools.count()
 
 
@@ -107,7 +107,7 @@ class Case:
 
     @property
     def goes_on(self) -> bool:
-        """Whether the gateway may go on as before, and its driver drive on."""
+        """Whether the gateway may continue as before, and its driver drive on."""
         order = self.order
         return self.crash is None and order is not None and order.of is Of.SUCCESSOR and order.step in EARLY
 
@@ -265,7 +265,7 @@ class Crossing:
     def _rest(self, since: float, driver: Part) -> float | None:
         """Wait until the robot has been at rest for REST_S; give the seconds to rest.
 
-        They run from ``since``, or, where the gateway goes on, from the driver's end.
+        They run from ``since``, or, where the gateway continues, from the driver's end.
         """
         deadline = time.monotonic() + PATIENCE_S
         while time.monotonic() < deadline:

@@ -36,7 +36,7 @@ SHOWN = (1, 53, 55)
 
 
 def use(pid: int) -> dict[str, int]:
-    """Look at what a process uses."""
+    """ReadPayload at what a process uses."""
     process = Path(f"/proc/{pid}")
     memory_kb = int((process / "status").read_text().partition("VmRSS:")[2].split()[0])
     counts = {"files": "fd", "threads": "task"}

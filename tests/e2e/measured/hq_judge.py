@@ -4,7 +4,7 @@
     python -m tests.e2e.measured.hq_judge --robot alf --driver ec --seconds 10
 
 Each program has its listener. All must see what the robot has; one after the other drives, while the others idle
-beside it as deployed programs do, sending neutral; then one drives to and fro for as long as is said.
+beside it as legacy programs do, sending neutral; then one drives to and fro for as long as is said.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ LEASE_S = 1.2
 LET_GO_S = 0.1
 """Seconds between letting go of a stick and pushing it: datagrams may overtake."""
 BETWEEN_S = 0.01
-"""Seconds between the two wheels; the bytes of one take 6 ms besides. Deployed controllers take 11 to 20 ms."""
+"""Seconds between the two wheels; the bytes of one take 6 ms besides. Legacy controllers take 11 to 20 ms."""
 IDLE_S = 0.3
 """Seconds between two neutrals of an external controller that idles."""
 JOIN_S = 0.5

@@ -97,7 +97,7 @@ def _see_hq_off(scene: HqScene) -> None:
 
 
 def _thaw(scene: HqScene) -> None:
-    """Let go on what was frozen: it finds all that was said meanwhile, and the program says more."""
+    """Let continue what was frozen: it finds all that was said meanwhile, and the program says more."""
     for process in (scene.driver, scene.hq):
         process.signal(signal.SIGCONT)
     time.sleep(SAID_AGAIN_S)

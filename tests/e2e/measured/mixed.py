@@ -97,7 +97,7 @@ class Run:
         return True
 
     def stop(self, number: int) -> None:
-        """Stop, as anybody may; whoever wants to go on acquires anew, which is refused until the stop was heard."""
+        """Stop, as anybody may; whoever wants to continue acquires anew, which is refused until the stop was heard."""
         self.put("stop", {})
         time.sleep(self.pace_s)
         until(self._holds, what="the lease after a stop")

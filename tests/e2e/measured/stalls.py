@@ -1,4 +1,4 @@
-"""A robot that stalls, or whose link is cut, while it is driven: how long after it goes on is it at rest?
+"""A robot that stalls, or whose link is cut, while it is driven: how long after it continues is it at rest?
 
     python -m tests.e2e.measured.stalls                      # everything, 30 repetitions; about an hour and a half
     python -m tests.e2e.measured.stalls --repetitions 2 --robots tcpudp-1.3,alf --stalls 2.5 --cuts 2 --out stalls.jsonl
@@ -6,13 +6,13 @@
 Each sitting has a real gateway process, a fragile robot in a process of its own that tells its commanded motion
 (:mod:`tests.e2e.rigs.fragile`), and a driver on the bus in a process of its own. It is driven for a moment; then
 
-stall: the robot's process is stopped (SIGSTOP) and goes on after some seconds (SIGCONT);
+stall: the robot's process is stopped (SIGSTOP) and continues after some seconds (SIGCONT);
 cut: what is between the robot's network namespace and the gateway's forwards nothing for some seconds. Both keep
      their addresses, routes and carriers, and nobody is told: the packets are lost as behind a switch without power.
 
 Meanwhile the driver goes neutral, is killed, falls silent, or (cuts only) drives on without ever being neutral. The
-time to rest runs from the moment when the robot or its link goes on, or from when the driver's motion had to end if
-that is later; a simulation that was held up by its own send goes on when its kernel has tried again ("held up": the
+time to rest runs from the moment when the robot or its link continues, or from when the driver's motion had to end if
+that is later; a simulation that was held up by its own send continues when its kernel has tried again ("held up": the
 longest time after the link was back). Then the robot must stay at rest for ``REST_S``, and be driven again over the
 same connection.
 A cut of ``SHOWN_S`` and more must show in ``status.reason``, no longer afterwards, and in the counter ``link_stalls``.
@@ -53,7 +53,7 @@ from tests.e2e.rigs.robots import SCALE
 from tests.ports import free_port
 
 LIMIT_S = 1.5
-"""Most seconds from going on to rest."""
+"""Most seconds from resuming to rest."""
 STALLS_S = (0.3, 0.7, 2.0, 2.5, 5.0, 20.0)
 CUTS_S = (1.0, 2.0, 4.0, 6.0, 8.0, 10.0)
 CAUSES = {"stall": ("neutral", "killed", "silent"), "cut": ("neutral", "killed", "silent", "driving")}
@@ -263,7 +263,7 @@ class Sitting:
             outcome.faults.append(f"status still shows the cut: {self._status['reason']}")
 
     def _disturb(self) -> tuple[float, float, float]:
-        """Stall the robot or cut its link; tell when, when the driver's motion had to end, and when it went on."""
+        """Stall the robot or cut its link; tell when, when the driver's motion had to end, and when it continued."""
         seconds, road, cause = self._case.seconds, self._road, self.outcome.cause
         went = time.monotonic()
         if road is not None:

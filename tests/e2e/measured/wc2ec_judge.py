@@ -129,7 +129,7 @@ class Deployed(_Webots):
     weights: ClassVar = {**dict.fromkeys(kinds, 3), "refused": 5, "refused_deployed": 5, "neutral": 1, "stop": 1}
 
     def compare(self, report: dict[str, Any]) -> None:
-        """Look at the last word to each wheel besides, which was the stop; the lift was left where it is."""
+        """ReadPayload at the last word to each wheel besides, which was the stop; the lift was left where it is."""
         super().compare(report)
         received = self.arrivals(report)
         for device in (LEFT, RIGHT):

@@ -1,4 +1,4 @@
-"""A robot's camera for end-to-end tests: the standard library's HTTP server, as on deployed robots.
+"""A robot's camera for end-to-end tests: the standard library's HTTP server, as on legacy robots.
 
 ``/stream.mjpg`` answers as the example "Web streaming" of the Raspberry Pi's camera library does.
 """

@@ -6,7 +6,7 @@ NAME is one of :data:`ROBOTS`. OPTIONS: more arguments of the robot's class, ``t
 ``tells``, as a JSON object.
 
 A robot that ``tells`` prints a line ``AT SPEED`` (monotonic seconds, fraction of full scale) for each change of what it
-last obeyed, and waits for its own sends as long as its kernel does: deployed ones block in them.
+last obeyed, and waits for its own sends as long as its kernel does: legacy ones block in them.
 """
 
 import asyncio
@@ -33,7 +33,7 @@ SEND_S = 3600.0
 HELD_UP_S = 0.1
 """Seconds of one send after which a robot's program counts as held up by it."""
 GOES_ON = "on"
-"""The word after the time at which such a program goes on."""
+"""The word after the time at which such a program continues."""
 WHEEL_M, FULL_M_S = 0.05, 0.5
 WHEELS = f"""
 bounds_default = [0.0, 1000.0]
@@ -99,7 +99,7 @@ def vehicle(dialect: alf_wire.Dialect) -> Kind:
 
 
 class _Controller(FragileWebotsController):
-    """Tells when it goes on after its own send held it up: it sends and reads one after the other.
+    """Tells when it continues after its own send held it up: it sends and reads one after the other.
 
     Once its kernel's buffer is full it waits until that kernel tries again, which nobody else can hasten.
     """

@@ -229,7 +229,7 @@ class Way(Generic[S]):
     connection_ends: bool = False
     """The robot gets no stop: its connection ends."""
     resumes: bool = False
-    """The time runs from when it goes on, and then the stop must come before everything else."""
+    """The time runs from when it continues, and then the stop must come before everything else."""
 
 
 def cut_off(scene: Scene) -> None:
@@ -244,7 +244,7 @@ def mend_road(scene: Scene) -> None:
 
 
 def freeze_gateway(scene: Scene) -> float:
-    """Freeze the gateway while the driver drives on; the time runs from when it goes on."""
+    """Freeze the gateway while the driver drives on; the time runs from when it continues."""
     scene.gateway.signal(signal.SIGSTOP)
     until(lambda: frozen(scene.gateway.process.pid), what="a frozen gateway")
     time.sleep(READ_S)
@@ -327,7 +327,7 @@ def heading() -> str:
     four = ("least", "median", "p99", "most")
     return (
         "Milliseconds to the first stop at the robot's socket. gateway-killed: to the end of the connection, there is\n"
-        "no stop; gateway-frozen, process-frozen: since it goes on. machine: how late the machine was, at most.\n"
+        "no stop; gateway-frozen, process-frozen: since it continues. machine: how late the machine was, at most.\n"
         f"{'':38}{'since the last motion':^36}{'since the loss':^36}\n"
         + _row("way", "n", *four, *four, "limit", "since", "late", "again", "faults", "machine")
     )
@@ -399,14 +399,14 @@ def _motion_faults(way: Way[S], driven: list[Frame], after: list[Frame], lost_at
     stale = [frame for frame in driven if frame.moves and frame.at >= lost_at]
     if way.resumes and stale and not _in_hand(driven, lost_at):
         numbers = f"{[frame.number for frame in stale]} after {_last_motion(driven[: -len(stale)]).number}"
-        found.append(f"what went on sent {len(stale)} motions before its stop: {numbers}")
+        found.append(f"what continued sent {len(stale)} motions before its stop: {numbers}")
     if moved := [frame for frame in after if frame.moves]:
         found.append(f"{len(moved)} motions after the stop, the first {(moved[0].at - stop_at) * 1000:.0f} ms after it")
     return found
 
 
 def _in_hand(driven: list[Frame], lost_at: float) -> bool:
-    """Tell whether what went on first did what it was about to do when it was frozen, between its look and its write.
+    """Tell whether what continued first did what it was about to do when it was frozen, between its look and its write.
 
     That is one motion, that came just after the last one before. The last one again is not; and what waited meanwhile
     would be found every time.

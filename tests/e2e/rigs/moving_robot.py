@@ -30,7 +30,7 @@ class MovingRobot:
         """When it told a speed, and which."""
         self.report: dict[str, Any] = {}
         self.went_on = 0.0
-        """When its program last went on after its own send held it up."""
+        """When its program last continued after its own send held it up."""
         self._ports: queue.Queue[int] = queue.Queue()
         told = json.dumps({"seed": seed, "tells": True, **options})
         self.part = Part(stack, *enter, *module("tests.e2e.rigs.fragile", name, host, told), heard=self._hear)

@@ -215,7 +215,7 @@ def test_motion_is_drive_info_in_the_units_of_the_dialect_or_the_settings(dialec
     assert Scene(dialect, **options).shown(motion) == [shown]
 
 
-# Nothing that deployed receivers break on
+# Nothing that legacy receivers break on
 
 anything = st.floats() | st.floats(-10, 10)
 ranges_of = st.lists(st.floats(width=32) | st.floats(0, 10, width=32), max_size=12)
@@ -311,7 +311,7 @@ def test_a_turn_without_speed_sets_the_wheels_and_is_no_motion() -> None:
     ],
 )
 def test_a_listener_serves_what_it_was_told_to_and_one_of_the_laser_takes_no_drives(options, kinds, driving) -> None:
-    """By default the laser until a client drives, from then on drive info: no deployed program tolerates both."""
+    """By default the laser until a client drives, from then on drive info: no legacy program tolerates both."""
     scene = Scene(clients=0)
     scene.side = AlfHq(AlfHqOptions(**options), scene.view)
     scene.tell(SCANNER, SCAN)

@@ -44,7 +44,7 @@ def live(moved: Car, seconds: float, repeated: DriveCommand | None = None) -> fl
 
 
 def seen_m(by: Car, angle_deg: float) -> float:
-    """The range at an angle, by the geometry of the deployed scanner."""
+    """The range at an angle, by the geometry of the legacy scanner."""
     return float(by.measure().points[round((angle_deg + 135.0) / 0.351562)]) / 1000
 
 

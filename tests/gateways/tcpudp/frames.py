@@ -60,7 +60,7 @@ def counted(text: bytes) -> bytes:
 
 
 def server_settings(versions: bytes = LISTED, block: str = ALL, client_id: int = 5) -> bytes:
-    """Packet 2; the size of the map follows the seven flags of 1.3 where the block does not go on by itself."""
+    """Packet 2; the size of the map follows the seven flags of 1.3 where the block does not continue by itself."""
     flags = bytes.fromhex(block)
     size = bytes.fromhex(SIZE_100_10) if len(flags) == 7 else b""
     return framed(1, 2, bytes([client_id]) + counted(versions) + flags + size)

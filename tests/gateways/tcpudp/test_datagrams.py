@@ -47,7 +47,7 @@ old_and_new = pytest.mark.parametrize("version", ["1.1", "1.3"])
 
 @pytest.fixture(autouse=True)
 def every_stray(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Look at every datagram of an attacker, however fast they come."""
+    """ReadPayload at every datagram of an attacker, however fast they come."""
     monkeypatch.setattr(datagrams, "STRAY_S", 0.0)
 
 

@@ -16,7 +16,7 @@ from zbridge.protocol.session import State
 POSE = m.ServerPosition(1.5, -2.25, 90.0)
 MOVES, ROTATES = m.ClientJoystickMove(0.0, 1.0, 0.5), m.ClientJoystickRotate(-0.75)
 PORT = 11000
-"""What deployed HQ programs bind."""
+"""What legacy HQ programs bind."""
 RIVAL = "another source of datagrams claims to be this client"
 BY_TCP = (State.ESTABLISHED, "tcp")
 SIZED = {"slam_map": True, "slam_map_size": 1000, "slam_map_interval": 10}
@@ -235,7 +235,7 @@ def test_motion_is_taken_by_either_channel_after_the_report_and_before_it_by_tcp
 
 
 def test_motion_by_datagram_of_an_hq_whose_probe_was_lost_is_claimed_and_taken() -> None:
-    """Deployed HQ programs of 1.3 send 11, 12 and 61 by UDP whatever was agreed, and bind port 11000."""
+    """Legacy HQ programs of 1.3 send 11, 12 and 61 by UDP whatever was agreed, and bind port 11000."""
     timed = unheard()
     for sender in (0, 1, 4, 6, 255):
         assert not timed.session.claims(f.bearing(f.MOVE, sender), PORT)
@@ -297,7 +297,7 @@ def test_of_two_sources_that_came_before_the_6_neither_is_heard_and_no_6_is_sent
         assert timed.frames("udp") == []
         assert [frame[5] for frame in timed.frames("tcp")] == [2, 4]
         assert timed.session.left_out == {RIVAL: 1}
-        assert timed.session.claims(f.MOVE, PORT), "by the port of deployed programs it may drive"
+        assert timed.session.claims(f.MOVE, PORT), "by the port of legacy programs it may drive"
 
 
 def test_an_hq_that_was_told_that_its_datagram_came_is_let_go_when_a_second_source_claims_to_be_it() -> None:

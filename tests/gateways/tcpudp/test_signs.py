@@ -42,7 +42,7 @@ def doubts(timed: f.Timed, until: float) -> tuple[str, ...]:
 
 @pytest.mark.parametrize("versions", [b"1.1", b"1.2", f.LISTED])
 def test_a_client_id_above_2_alone_is_no_sign(versions: bytes) -> None:
-    """A deployed robot gave its first client the id 35. A robot without datagrams may be silent until it is asked."""
+    """A legacy robot gave its first client the id 35. A robot without datagrams may be silent until it is asked."""
     for client_id in (0, 1, 2, 3, 4, 35, 255):
         timed = f.Timed(HqRole(limits(0.01))).come((0.1, "tcp", settings(client_id, versions=versions)))
         timed.until(100.0)

@@ -114,7 +114,7 @@ ROWS = {
     "neutral after another mode that waits": (WELL, "auto +0 manual neutral +0.1 stop +2", "A(MS)+M manuals"),
     # 1.1 and 1.2 ignore the first stop that they read alone after a stall, and some join what comes within 0.2 s
     "a routine stop to them is one packet": (BADLY, "left +0.1 once +3 once +3", "LSS"),
-    "the next one goes on where the one before was": (BADLY, "auto +1 once +0.12 once +1", "AA NS"),
+    "the next one continues where the one before was": (BADLY, "auto +1 once +0.12 once +1", "AA NS"),
     "its packets are an eighth of a second apart": (BADLY, "auto +1 once +0.13", "AA NS"),
     # what is sent again to robots that misread
     "robots that read well are sent it once": (WELL, "manual on +5", "MI"),

@@ -142,7 +142,7 @@ def test_a_robot_is_ready_while_its_session_is_established_and_refuses_all_befor
 
 
 def polar(ranges: list[float], begin: float = 0.0, step: float = 1.0, *within: float) -> list[float]:
-    """What becomes of a scan that begins at an angle and goes on by another, degrees."""
+    """What becomes of a scan that begins at an angle and continues by another, degrees."""
     scan = Scan(math.radians(begin), math.radians(step), *(within or (0.1, 8.0)), np.array(ranges, np.float32))  # type: ignore[misc]
     values = polar_ranges(scan, 0.01)
     assert (values.shape, values.dtype) == ((360,), np.float32)

@@ -1,4 +1,4 @@
-"""The recorded session of the field, each segment at its time, on to the fleet; ``test_hq`` goes on to a controller.
+"""The recorded session of the field, each segment at its time, on to the fleet; ``test_hq`` continues to a controller.
 
 The values are read off the bytes by hand: twelve registrations, then twenty rounds of six readings, and one more.
 """

@@ -68,7 +68,7 @@ def around(ranges: Iterable[float], *, first_deg: float = 0.0, step_deg: float =
 
 
 def understood(sent: bytes) -> str:
-    """What a deployed controller makes of bytes."""
+    """What a legacy controller makes of bytes."""
     heard = Reader("deployed").take(sent)
     assert not any(one.deadly for one in heard)
     assert b"".join(one.raw for one in heard) == sent
@@ -361,7 +361,7 @@ def joined(said: str, join_s: float) -> str:
 @pytest.mark.parametrize(
     ("join_s", "said", "driven"),
     [
-        # deployed controllers take 11 to 20 ms from one wheel to the other
+        # legacy controllers take 11 to 20 ms from one wheel to the other
         *((0.03, f"0.1 left 10; {at} right 10", f"{at}: 1 0") for at in (0.1, 0.111, 0.129)),
         (0.03, "0.1 right 10; 0.12 left 10", "0.12: 1 0"),
         # of one wheel alone there are 0.5 m/s and -5/3 rad/s, to full scale

@@ -81,7 +81,7 @@ class Wire:
 
     @classmethod
     def of(cls, robot: str) -> Self:
-        """One of the ROBOTS; those of deployed programs are the CAR, which has sent data."""
+        """One of the ROBOTS; those of legacy programs are the CAR, which has sent data."""
         return cls(b"" if robot.startswith("draft") else READY, **ROBOTS[robot])
 
     def connect(self, greeting: bytes = b"") -> tuple[tuple[Topic, FleetMessage], ...]:

@@ -146,7 +146,7 @@ async def test_a_name_that_is_alive_is_refused(recording: Path) -> None:
     stage = Stage(recording)
     stage.bus.announce("fleet/again/@alive/gateway")
     with pytest.raises(Held, match="again is alive"):
-        async with asyncio.timeout(20):  # a replay that begins goes on
+        async with asyncio.timeout(20):  # a replay that begins continues
             await Replay(stage.bus.join("2"), stage.plan).run()
     assert stage.bus.values("fleet/again/**") == []
 

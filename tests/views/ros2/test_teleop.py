@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from zbridge.bus.fake import FakeBus
-from zbridge.bus.interface import Lane, Sample
+from zbridge.bus.interface import PriorityClass, Sample
 from zbridge.client import Fleet
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Control
@@ -41,7 +41,7 @@ class Scene:
         self.takes = dict(self.bus.network.subscribers)
         """What is called for a sample, by its key; also after the end."""
         ((_, self.on_token),) = self.bus.network.watchers
-        self.sort: Any = self.bus.network.lanes[self.endpoint().key]
+        self.sort: Any = self.bus.network.priorities[self.endpoint().key]
 
     def needing(self) -> list[bool]:
         """Which publishers need neutral."""
@@ -176,20 +176,20 @@ async def test_what_a_known_publisher_sends_is_taken_at_a_bounded_rate_and_stran
     known, stranger = scene.endpoint(), scene.endpoint()
     scene.bus.announce(known.token())
 
-    def lanes(endpoint: Endpoint, count: int) -> int:
+    def priorities(endpoint: Endpoint, count: int) -> int:
         beside = Attachment(1, 1, endpoint.gid()).encode()
         taken = [scene.sort("key", beside, len(FORWARD), lambda: FORWARD) for _ in range(count)]
-        assert set(taken) <= {Lane.OTHER, None}
-        return sum(lane is not None for lane in taken)
+        assert set(taken) <= {PriorityClass.OTHER, None}
+        return sum(priority is not None for priority in taken)
 
-    assert RATE_HZ <= lanes(known, 1000) < 2 * RATE_HZ
-    assert STRANGERS_HZ <= lanes(stranger, 1000) < 2 * STRANGERS_HZ
+    assert RATE_HZ <= priorities(known, 1000) < 2 * RATE_HZ
+    assert STRANGERS_HZ <= priorities(stranger, 1000) < 2 * STRANGERS_HZ
     assert scene.counted("strangers") == 1000
     assert scene.counted("too_fast") > 500
     await asyncio.sleep(2 * SETTLE_S)
     scene.put(known)
     beside = Attachment(1, 1, known.gid()).encode()
-    assert scene.sort("key", beside, len(FORWARD), lambda: FORWARD) is Lane.COMMAND
+    assert scene.sort("key", beside, len(FORWARD), lambda: FORWARD) is PriorityClass.COMMAND
     await scene.teleop.close()
 
 

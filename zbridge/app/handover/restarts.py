@@ -130,7 +130,7 @@ class Restarts:
             return
 
     def deposit(self, parcel: Parcel, budget: Budget) -> HandoverState | None:
-        """Describe the robot's part as it is now, for a successor of a gateway that died; None where none can go on."""
+        """Return the robot's part for the successor of a gateway that dies; None if no successor could continue."""
         device = self.device.deposit(parcel, budget) if self.device is not None else None
         claim = self.claim.export(parcel) if self.claim is not None else None
         if device is None or not claim:
@@ -145,7 +145,7 @@ class Restarts:
             self._tasks.add(task)
             task.add_done_callback(self._tasks.discard)
 
-        return bus.answer(self._keys.key("@rpc/restart/*"), take, lane=NameFilter(self._clock))
+        return bus.answer(self._keys.key("@rpc/restart/*"), take, priority=NameFilter(self._clock))
 
     async def _restart_for(self, question: IncomingQuery, bus: Bus) -> None:
         try:

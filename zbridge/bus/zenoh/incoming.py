@@ -1,7 +1,7 @@
 """What comes in from Zenoh: samples, queries, changes of liveliness, and replies to our own queries.
 
-The functions that ``*_callback`` return run on Zenoh's threads. They choose a lane, copy what the event loop needs and
-put it into the inbox, or call a handler that wants to be called there.
+The functions that ``*_callback`` return run on Zenoh's threads. They choose a priority, copy what the event loop needs
+and put it into the inbox, or call a handler that wants to be called there.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import zenoh
 import zenoh.ext
 
 from zbridge.bus.inbox import Inbox, Source
-from zbridge.bus.interface import Answer, Lane, Look, Sample, Sort
+from zbridge.bus.interface import Answer, PriorityClass, ReadPayload, Sample, Sort
 from zbridge.bus.writer import Writer
 from zbridge.bus.zenoh.publishers import reply_and_drop
 from zbridge.errors import BusError, PayloadError, Refused, refusal
@@ -36,20 +36,22 @@ _REPLIES_OF_EACH = 16
 _DENIED = zenoh.Encoding(payloads.ENCODING).with_schema(payloads.schema(Denied))
 
 
-def lane_callback(lane: Lane, source: Source) -> Callable[[Any], None]:
-    """Make the callback of what comes by one lane."""
+def priority_callback(priority: PriorityClass, source: Source) -> Callable[[Any], None]:
+    """Make the callback of input that has one fixed priority."""
 
     def store(raw: Any) -> None:
-        source.put(raw, lane)
+        source.put(raw, priority)
 
     return store
 
 
-def loop_callback(inbox: Inbox, handler: Callable[[Sample], None], lane: Lane | Sort) -> Callable[[zenoh.Sample], None]:
+def loop_callback(
+    inbox: Inbox, handler: Callable[[Sample], None], priority: PriorityClass | Sort
+) -> Callable[[zenoh.Sample], None]:
     """Make the callback of samples whose handler is called on the event loop's thread."""
-    if isinstance(lane, Lane):
-        return lane_callback(lane, inbox.source(handler, read_sample))
-    return sorted_callback(lane, inbox.source(handler))
+    if isinstance(priority, PriorityClass):
+        return priority_callback(priority, inbox.source(handler, read_sample))
+    return sorted_callback(priority, inbox.source(handler))
 
 
 def direct_callback(key_expr: str, handler: Callable[[Sample], None]) -> Callable[[zenoh.Sample], None]:
@@ -75,11 +77,11 @@ def sorted_callback(sort: Sort, source: Source) -> Callable[[zenoh.Sample], None
         shown = attachment.to_bytes() if attachment is not None else None
         size = len(payload) + (len(shown) if shown is not None else 0)
         key = str(sample.key_expr)
-        lane = sort(key, shown, size, payload.to_bytes)
-        if lane is Lane.STOP:
-            source.fold(Sample(key, b"", shown), lane)  # all stops of this lane are the same
-        elif lane is not None:
-            source.put(Sample(key, payload.to_bytes(), shown), lane, size)
+        priority = sort(key, shown, size, payload.to_bytes)
+        if priority is PriorityClass.STOP:
+            source.fold(Sample(key, b"", shown), priority)  # all stops of this priority are the same
+        elif priority is not None:
+            source.put(Sample(key, payload.to_bytes(), shown), priority, size)
 
     return store
 
@@ -97,22 +99,22 @@ def query_callback(sort: Sort, source: Source, unanswered: Count) -> Callable[[z
         payload = query.payload
         shown = payload.to_bytes() if payload is not None else None
         size = len(shown) if shown is not None else 0
-        lane = sort(str(query.key_expr), shown, size, bytes)
-        if lane is None:
+        priority = sort(str(query.key_expr), shown, size, bytes)
+        if priority is None:
             unanswered.value += 1
             query.drop()  # type: ignore[no-untyped-call]
         else:
-            source.put(query, lane, size)
+            source.put(query, priority, size)
 
     return store
 
 
-def rate_limited(lane: Lane, clock: Callable[[], float]) -> Sort:
-    """Sort so many queries a second into a lane; those above get no answer."""
+def rate_limiting(priority: PriorityClass, clock: Callable[[], float]) -> Sort:
+    """Give so many queries a second this priority; those above get no answer."""
     limit = RateLimit(QUERIES_HZ)
 
-    def sort(key: str, shown: bytes | None, size: int, look: Look) -> Lane | None:
-        return lane if limit.take(clock()) else None
+    def sort(key: str, shown: bytes | None, size: int, read_payload: ReadPayload) -> PriorityClass | None:
+        return priority if limit.take(clock()) else None
 
     return sort
 

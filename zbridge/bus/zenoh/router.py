@@ -54,7 +54,7 @@ class ZenohRouter(ZenohBus):
 def hear_log(handler: Callable[[str], None]) -> None:
     """Start Zenoh's log and give its lines to ``handler``, without colours, on a thread of its own.
 
-    Zenoh writes to standard output: that becomes a pipe, and what Python prints goes on to where it went before.
+    Zenoh writes to standard output: that becomes a pipe, and what Python prints is still written where it was before.
     """
     read, write = os.pipe()
     sys.stdout.flush()

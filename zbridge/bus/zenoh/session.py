@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import zenoh
 
 from zbridge.bus.inbox import Inbox
-from zbridge.bus.interface import Answer, BusSettings, Handle, IncomingQuery, Lane, Publisher, Sample, Sort
+from zbridge.bus.interface import Answer, BusSettings, Handle, IncomingQuery, PriorityClass, Publisher, Sample, Sort
 from zbridge.bus.late_join import LateJoin
 from zbridge.bus.tls.files import own_certificate
 from zbridge.bus.tls.membership import require_member
@@ -24,10 +24,10 @@ from zbridge.bus.zenoh.incoming import (
     Replies,
     ZenohQuery,
     direct_callback,
-    lane_callback,
     loop_callback,
+    priority_callback,
     query_callback,
-    rate_limited,
+    rate_limiting,
     read_change,
     read_reply,
     subscribe_with_kept,
@@ -137,7 +137,7 @@ class ZenohBus:
         return self._keep(self._publishers.make(key, topic, last))
 
     def on_relief(self, handler: Callable[[], None]) -> None:
-        """Call ``handler`` when a paused source may go on."""
+        """Call ``handler`` when a paused source may resume."""
         self._relief.append(handler)
 
     def subscribe(
@@ -145,22 +145,23 @@ class ZenohBus:
         key_expr: str,
         handler: Callable[[Sample], None],
         *,
-        lane: Lane | Sort = Lane.OTHER,
+        priority: PriorityClass | Sort = PriorityClass.OTHER,
         history: bool = False,
         kept: bool = False,
         direct: bool = False,
     ) -> Handle:
-        """Subscribe; samples come by a fixed lane or as a Sort chooses. history: ask for last values too.
+        """Subscribe to ``key_expr``.
 
+        priority: of all samples, or a Sort that chooses it for each. history: ask for last values too.
         kept: the frames that publishers have kept come too, those of publishers that appear later as well.
-        direct: the handler is called on one of Zenoh's threads, for streams without lane and history: it must be quick,
-        and may put frames on another bus.
+        direct: the handler is called on one of Zenoh's threads, for streams without priority and history: it must be
+        quick, and may put frames on another bus.
 
-        Of the samples that a Sort sends by the lane STOP only one waits at a time: those that follow are the same stop.
+        Of the samples that a Sort gives priority STOP only one waits at a time: those that follow are the same stop.
         """
         if history:
             return self._keep(LateJoin(self, key_expr, handler))
-        store: Any = direct_callback(key_expr, handler) if direct else loop_callback(self._inbox, handler, lane)
+        store: Any = direct_callback(key_expr, handler) if direct else loop_callback(self._inbox, handler, priority)
         if direct or not self._threads:
             store = prompt(store)
         if kept:
@@ -172,7 +173,7 @@ class ZenohBus:
         key: str,
         handler: Callable[[IncomingQuery], None],
         *,
-        lane: Lane | Sort = Lane.OTHER,
+        priority: PriorityClass | Sort = PriorityClass.OTHER,
         complete: bool = False,
     ) -> Handle:
         """Answer queries that ask for ``key``, with or without wildcards; the last chunk of ``key`` may be one.
@@ -182,7 +183,9 @@ class ZenohBus:
         writer = self._writer
         source = self._inbox.source(handler, lambda raw: ZenohQuery(raw, key, writer))
         store = query_callback(
-            rate_limited(lane, self._loop.time) if isinstance(lane, Lane) else lane, source, self._unanswered
+            rate_limiting(priority, self._loop.time) if isinstance(priority, PriorityClass) else priority,
+            source,
+            self._unanswered,
         )
         if complete:
             return self._keep(Declared(self._session.declare_queryable(key, store, complete=True)))
@@ -231,7 +234,7 @@ class ZenohBus:
         return self._keep(self._alive.add(key_expr, handler))
 
     def _declare_alive(self, key_expr: str, handler: Changed) -> Handle:
-        store = lane_callback(Lane.STOP, self._inbox.source(lambda change: handler(*change), read_change))
+        store = priority_callback(PriorityClass.STOP, self._inbox.source(lambda change: handler(*change), read_change))
         watch = self._session.liveliness().declare_subscriber(key_expr, threadless(store), history=True)
         return Declared(watch)
 

@@ -187,7 +187,7 @@ class RobotCommands(ViewerCommands):
     def _stopped(self, robots: list[str]) -> None:
         for (_, robot), pilot in self._pilots.items():
             if robot in robots:
-                pilot.hold_back(f"{robot} was stopped")
+                pilot.require_neutral(f"{robot} was stopped")
 
     async def _stop(self, robots: list[str]) -> None:
         """Stop robots; raise Refused or BusError for the first that was not confirmed."""

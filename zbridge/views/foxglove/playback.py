@@ -227,7 +227,7 @@ class Playback(ViewerSource):
                     continue
                 ahead.reverse()
             now = self._loop.time()
-            self._hold_back(ahead, now)
+            self._delay_clock(ahead, now)
             while ahead and self._clock.playing and self._clock.wait_s(ahead[-1].log_ns, now) <= 0:
                 message = ahead.pop()
                 self.hub.publish(message.topic, message.log_ns, message.payload)
@@ -247,8 +247,8 @@ class Playback(ViewerSource):
             async with asyncio.timeout(wait_s):
                 await self._changed.wait()
 
-    def _hold_back(self, ahead: list[PlayedMessage], now: float) -> None:
-        """Let the clock wait where reading cannot keep up with it."""
+    def _delay_clock(self, ahead: list[PlayedMessage], now: float) -> None:
+        """Set the clock back if reading cannot keep up with it."""
         if ahead and self._clock.playing and self._clock.wait_s(ahead[-1].log_ns, now) < -LATE_S:
             self._clock.seek(ahead[-1].log_ns, now)
 

@@ -15,7 +15,7 @@ from collections.abc import Callable
 
 import msgspec
 
-from zbridge.bus import Bus, Handle, Lane, Look, Sample
+from zbridge.bus import Bus, Handle, PriorityClass, ReadPayload, Sample
 from zbridge.errors import BusError, ConfigError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import Text
@@ -77,7 +77,7 @@ class BusCapture:
         """Subscribe."""
         bus, plan = self._bus, self._plan
         self._handles = [
-            *(bus.subscribe(key_expr, self._store, lane=self._receive) for key_expr in plan.key_exprs),
+            *(bus.subscribe(key_expr, self._store, priority=self._receive) for key_expr in plan.key_exprs),
             *(bus.watch_alive(f"{plan.realm}/{name}/@alive/*", self._on_token) for name in plan.names),
         ]
         if plan.names:
@@ -92,7 +92,9 @@ class BusCapture:
             task.cancel()
         self._querying.clear()
 
-    def _receive(self, key: str, attachment: bytes | None, size: int, read_payload: Look) -> Lane | None:
+    def _receive(
+        self, key: str, attachment: bytes | None, size: int, read_payload: ReadPayload
+    ) -> PriorityClass | None:
         """Store a sample; on Zenoh's threads. The intake counts what it drops."""
         self._intake.put_sized(key, size, read_payload, attachment)
         if self._querying and len(self._live) < LIVE_KEYS:
@@ -100,7 +102,7 @@ class BusCapture:
         return None
 
     def _store(self, sample: Sample) -> None:
-        """Store a sample of a bus that has no lanes."""
+        """Store a sample of a bus that has no priorities."""
         self._receive(sample.key, sample.attachment, len(sample.payload), lambda: sample.payload)
 
     def _on_token(self, key: str, alive: bool) -> None:

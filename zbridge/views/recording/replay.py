@@ -64,7 +64,7 @@ class Survey(msgspec.Struct, frozen=True):
 
 
 def survey(path: Path) -> Survey:
-    """Look through the begin of a recording; raise ConfigError where there is no robot."""
+    """ReadPayload through the begin of a recording; raise ConfigError where there is no robot."""
     keys: set[str] = set()
     statuses: dict[str, Status] = {}
     with open_recording(path) as file:

@@ -16,7 +16,7 @@ from typing import Any
 
 import msgspec
 
-from zbridge.bus import Bus, Handle, IncomingQuery, Lane, Look, Publisher, Sample
+from zbridge.bus import Bus, Handle, IncomingQuery, PriorityClass, Publisher, ReadPayload, Sample
 from zbridge.control.latch import STOPS, read_stop
 from zbridge.control.requests import RefusalCounts
 from zbridge.errors import NotReady, PayloadError, Unsupported
@@ -83,7 +83,7 @@ class ReplayedRobot:
         """Appear on the bus, and refuse commands from now on."""
         bus, key = self._bus, self._keys.key
         self._handles = [
-            bus.subscribe(key("@cmd/**"), self._on_command, lane=self._admit),
+            bus.subscribe(key("@cmd/**"), self._on_command, priority=self._admit),
             *(bus.answer(key(f"@rpc/control/{name}"), self._on_lease) for name in _LEASE),
             bus.answer(key("@rpc/control/refused/*"), lambda query: query.answer(payloads.encode(Query()))),
             *(bus.answer(key(topic.path), self._on_question) for topic in (topics.RPC_MAP, topics.RPC_POSE)),
@@ -183,8 +183,8 @@ class ReplayedRobot:
 
     # On the event loop
 
-    def _admit(self, key: str, attachment: bytes | None, size: int, read_payload: Look) -> Lane | None:
-        return Lane.OTHER if self._rate.take(time.monotonic()) else None
+    def _admit(self, key: str, attachment: bytes | None, size: int, read_payload: ReadPayload) -> PriorityClass | None:
+        return PriorityClass.OTHER if self._rate.take(time.monotonic()) else None
 
     def _on_command(self, sample: Sample) -> None:
         command = sample.key.rpartition("@cmd/")[2]

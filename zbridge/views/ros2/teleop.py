@@ -14,7 +14,7 @@ import asyncio
 import math
 from functools import partial
 
-from zbridge.bus import Bus, Handle, Lane, Look, Sample
+from zbridge.bus import Bus, Handle, PriorityClass, ReadPayload, Sample
 from zbridge.client import Robot
 from zbridge.client.pilot import Pilot
 from zbridge.errors import BusError, Malformed, PayloadError, ProtocolError, Refused, Unsupported
@@ -96,7 +96,7 @@ class Teleop:
         for type_name in MOST_BYTES:
             endpoint = self._side.endpoint(node, Kind.SUBSCRIBER, self.topic, type_name, KEEP_LAST_10)
             sort = partial(self._sort, MOST_BYTES[type_name])
-            handles.append(bus.subscribe(endpoint.key, partial(self._take, type_name), lane=sort))
+            handles.append(bus.subscribe(endpoint.key, partial(self._take, type_name), priority=sort))
             handles.append(bus.announce(endpoint.token()))
         handles.append(bus.watch_alive(self._publishers, self._on_token))
         return handles
@@ -230,13 +230,15 @@ class Teleop:
     def stopped(self, why: str) -> None:
         """The robot was stopped: whoever commands motion now meant it before."""
         for pilot in self._pilots.values():
-            pilot.hold_back(why)
+            pilot.require_neutral(why)
             pilot.release()
 
     # What they command
 
-    def _sort(self, most_bytes: int, key: str, attachment: bytes | None, size: int, look: Look) -> Lane | None:
-        """Choose the lane; on Zenoh's threads."""
+    def _sort(
+        self, most_bytes: int, key: str, attachment: bytes | None, size: int, read_payload: ReadPayload
+    ) -> PriorityClass | None:
+        """Choose the priority; on Zenoh's threads."""
         if attachment is None or len(attachment) != _ATTACHED_BYTES or size > most_bytes + _ATTACHED_BYTES:
             self._counts["malformed"].value += 1
             return None
@@ -245,12 +247,13 @@ class Teleop:
         now = self._loop.time()
         if limit is None:
             self._counts["strangers"].value += 1
-            return Lane.OTHER if self._strangers.take(now) else None
+            return PriorityClass.OTHER if self._strangers.take(now) else None
         if not limit.take(now):
             self._counts["too_fast"].value += 1
             return None
         driver = self._driving.driver
-        return Lane.COMMAND if driver is not None and driver is self._driving.publishers.get(gid) else Lane.OTHER
+        drives = driver is not None and driver is self._driving.publishers.get(gid)
+        return PriorityClass.COMMAND if drives else PriorityClass.OTHER
 
     def _take(self, type_name: str, sample: Sample) -> None:
         if not self._handles:  # it waited to be taken until nothing may be driven any more

@@ -30,7 +30,7 @@ MESSAGES: dict[str, dict[Dialect, bytes]] = {
 def conversations(text: str, **options: dict[str, Any]) -> pytest.MarkDecorator:
     """Parametrise a test over the options of a judge and the steps of a conversation with it, one row each.
 
-    A row is ``sentence [options]: step / step``; an indented line goes on with the row before.
+    A row is ``sentence [options]: step / step``; an indented line continues the row before.
     """
     table: dict[str, Script] = {}
     for row in re.split(r"\n(?! )", text.strip()):

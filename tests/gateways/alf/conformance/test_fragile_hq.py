@@ -177,7 +177,7 @@ ends with END and takes the answer: begin_end / < END / > INFO END / rest / clos
     / begin_end / end_ended
 ends with END and takes the answer [binary]: begin_end / < END / > INFO END / rest / close / over / end_ended / ok
 leaves with END when cancelled: cancel / rest END / ok
-reads no more after ten measurements and goes on driving [driving_program, driving]:
+reads no more after ten measurements and continues driving [driving_program, driving]:
     > INIT SCAN SCAN SCAN SCAN SCAN SCAN SCAN SCAN SCAN SCAN / say 1|broken;nan; / > END / scans 10 / reads GOOD GOOD
     / fill / close / over / scans 10 / ok / ? it reads no more, after 10 measurements
 ends although it reads no more [one_scan]: > INIT SCAN / scans 1 / begin_end / end_ended / over / rest END / ok

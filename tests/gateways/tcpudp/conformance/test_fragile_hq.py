@@ -238,8 +238,8 @@ async def test_it_dies_of(options: dict[str, Any], steps: list[str]) -> None:
     a missing 4 is an event | 1.3 quick | greet SETTINGS_1.3_UDP; ? no 4 within 0.1 s of the 3; ok
     a lost answer is followed by true all the same in 1.3 | 1.3 quick | probing; < CONNECTED
         ; ? no 6 within 0.1 s of the 5; > POSITION; by_udp POSITION; count 55 2; ok
-    after a lost probe 1.1 goes on by TCP | 1.1 quick | probing 1.1; < NOT_CONNECTED; does move 0 1; < FORWARD
-    after a lost probe 1.3 goes on by UDP | 1.3 quick | probing; < CONNECTED; does move 0 1; expect_udp FORWARD
+    after a lost probe 1.1 continues by TCP | 1.1 quick | probing 1.1; < NOT_CONNECTED; does move 0 1; < FORWARD
+    after a lost probe 1.3 continues by UDP | 1.3 quick | probing; < CONNECTED; does move 0 1; expect_udp FORWARD
     with UDP agreed, the stick goes by UDP and 13 by TCP | 1.1 | shake 1.1 udp; does move 0 1; does rotate -0.75
         ; does idle; expect_udp FORWARD; expect_udp TURN; < STOP
     1.3 loses the stick where no 4 was sent | 1.3 | shake; established; does move 0 1; does idle; < STOP
@@ -294,7 +294,7 @@ async def test_a_robot_that_behaves_is_not_reproached(version: str, udp: bool) -
 
 
 async def test_a_captured_robot_is_reproached_for_what_the_page_forbids_the_gateway_only() -> None:
-    """The deployed robot gives its client the id 1, and its maps do not have the size it announced."""
+    """The legacy robot gives its client the id 1, and its maps do not have the size it announced."""
     hq = program(lidar_sim=True)
     async with facing(hq) as robot:
         await robot.accept("")

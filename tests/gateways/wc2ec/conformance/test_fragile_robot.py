@@ -98,7 +98,7 @@ class Talk(Scene):
         assert self.judge.stuck
 
     async def data(self, count: str) -> None:
-        """It goes on measuring."""
+        """It continues measuring."""
         for _ in range(int(count)):
             assert (await self.peer.measurement())[0] == 1
 

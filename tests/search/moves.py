@@ -56,7 +56,7 @@ def moves(world: World, bounds: Bounds) -> Iterator[Move]:
 def _of_programs(world: World, bounds: Bounds) -> Iterator[Move]:
     room = len(world.net) < bounds.channel
     for number, holder in enumerate(world.holders):
-        state = holder.client._state.value
+        state = holder.client.state.value
         if room and state in ("free", "dropped", "returning"):
             yield f"{number} wants", lambda world, number=number: world.holders[number].want()
         if bounds.drops and state not in ("free", "dropped", "returning") and (room or not holder.held):

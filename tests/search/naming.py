@@ -203,11 +203,11 @@ class _Namer:
         )  # fmt: skip
         news = world.news[number]
         return (
-            client._state.value,
+            client.state.value,
             signer and (self.leases[signer.lease], self.numbers.rank(signer.lease, "commands", signer._commands),
                         self.numbers.rank(signer.lease, "questions", signer._questions), self._ago(client._expires_at)),
             self._ago(client._due_at) if client.deadline() is not None else 0,
-            self._ago(client._wait_until) if client._state.value in _WAITING else 0,
+            self._ago(client._wait_until) if client.state.value in _WAITING else 0,
             waits, self.tokens[client.request.alive or ""], holder._token is not None,
             news and (self.leases[news.lease] if news.lease else -1, news.holder == client.request.who),
             self.counts[number],

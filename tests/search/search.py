@@ -177,7 +177,7 @@ def _next(wanted: int | None, world: World) -> World:
     world.channel = 100
     for number, holder in enumerate(world.holders):
         if wanted == number:
-            if holder.client._state.value in ("free", "dropped", "returning"):
+            if holder.client.state.value in ("free", "dropped", "returning"):
                 holder.want()
         elif wanted is not None:
             holder.drop()

@@ -209,8 +209,8 @@ MUTANTS = (
         "stop never written",
         None,
         ENFORCER,
-        "        if event.stops:\n            self._send_stop()",
-        "        if False:\n            self._send_stop()",
+        "                if event.stops:\n                    self._send_stop()",
+        "                if False:\n                    self._send_stop()",
     ),
     Mutant(
         "autonomous mode survives a stall",

@@ -34,6 +34,19 @@ def suspended_s() -> float:
     return since_boot - time.monotonic()
 
 
+class Clocks(msgspec.Struct, frozen=True):
+    """The clocks of one machine.
+
+    clock: seconds on the time line of event loops, from any thread. clock_ns: Unix time. raw_ms, suspended_s: see the
+    functions.
+    """
+
+    clock: Callable[[], float] = time.monotonic
+    clock_ns: Callable[[], int] = time.time_ns
+    raw_ms: Callable[[], float] = raw_ms
+    suspended_s: Callable[[], float] = suspended_s
+
+
 class Conditions:
     """Lasting faults of a robot that is served all the same, or of its gateway; ``status.reason`` shows them.
 

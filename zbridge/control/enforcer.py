@@ -21,7 +21,7 @@ from zbridge.control.admission import CommandFilter, RefusalLimit
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
 from zbridge.control.context import RobotContext
-from zbridge.control.events import AuthorityEvent, CommandSender, EventKind
+from zbridge.control.events import CommandSender, EventKind
 from zbridge.control.latch import Latches, LatchRecord, read_stop
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import Standstill
@@ -180,11 +180,6 @@ class Enforcer:
         self.authority.require_neutral(reason, stops=stops)
         self.settle()
 
-    def bus_lost(self) -> None:
-        """End the lease: its holder cannot reach the gateway any more."""
-        self.authority.bus_lost()
-        self.settle()
-
     # What follows from a decision, and from time going by
 
     def settle(self) -> None:
@@ -193,7 +188,9 @@ class Enforcer:
             self._settle_events()
         deadline = self.authority.deadline()
         if deadline is not None and deadline < self._timer_at:
-            self._arm(deadline)
+            if self._timer is not None:
+                self._timer.cancel()
+            self._timer_at, self._timer = deadline, self._loop.call_at(deadline, self._on_time)
         stops_anew, self._stops_anew = self._stops_anew, False
         self.settled(at_once=stops_anew)
 
@@ -236,25 +233,22 @@ class Enforcer:
         changed = False
         while events := self.authority.events():
             for event in events:
-                changed = changed or event.what is not EventKind.REFUSED
-                self._carry_out(event)
+                if event.what is EventKind.REFUSED:
+                    self._refused.value += 1
+                else:
+                    changed = True
+                    if event.what is not EventKind.ACQUIRED and self._limits is not None:
+                        self._limits.stopped()
+                    self._context.metrics.count("control", what=event.what.value).value += 1
+                if event.stops:
+                    self._send_stop()
+                if event.what in (EventKind.LATCHED, EventKind.UNLATCHED):
+                    self._save_latches()
+                self._audit.write(event)
             if self._control_due is None and not self._closed:
                 self._control_due = self._loop.call_later(_CONTROL_S, self.report)
         if changed:
             self.report()
-
-    def _carry_out(self, event: AuthorityEvent) -> None:
-        if event.what is EventKind.REFUSED:
-            self._refused.value += 1
-        else:
-            if event.what is not EventKind.ACQUIRED and self._limits is not None:
-                self._limits.stopped()
-            self._context.metrics.count("control", what=event.what.value).value += 1
-        if event.stops:
-            self._send_stop()
-        if event.what in (EventKind.LATCHED, EventKind.UNLATCHED):
-            self._save_latches()
-        self._audit.write(event)
 
     def _save_latches(self) -> None:
         """Write the latched stops down; ``control`` confirms a new one when that has ended."""
@@ -287,12 +281,6 @@ class Enforcer:
             self._standstill.stop()
         except Refused as refusal:
             self.authority.refuse("stop", refusal)
-
-    def _arm(self, deadline: float) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-        self._timer_at = deadline
-        self._timer = self._loop.call_at(deadline, self._on_time)
 
     def _on_time(self) -> None:
         if self._timer is not None:

@@ -277,7 +277,8 @@ class Device(Transferable):
 
     def _on_bus(self, connected: bool) -> None:
         if not connected:
-            self._enforcer.bus_lost()
+            self._enforcer.authority.bus_lost()
+            self._enforcer.settle()
         else:
             self._latch_news.returned()
 

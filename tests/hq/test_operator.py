@@ -29,9 +29,10 @@ from zbridge.fleet.messages import (
     Switch,
 )
 from zbridge.fleet.view import RobotView
-from zbridge.hq.bridge import PUBLISHERS, Bridge
+from zbridge.hq.context import Bridge
 from zbridge.hq.intent import Intent
 from zbridge.hq.operator import Operator
+from zbridge.lease.commands import PUBLISHERS
 from zbridge.protocol.plugin import ATTEND_S
 
 DEADMAN_S = 1.25

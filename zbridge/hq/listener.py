@@ -15,10 +15,9 @@ from typing import Any
 
 from zbridge.control.context import Clocks
 from zbridge.hq.admission import FULL, Admission
-from zbridge.hq.bridge import Bridge
 from zbridge.hq.broadcast import Broadcast
 from zbridge.hq.client import SWEEP_S, Client
-from zbridge.hq.context import ListenerContext, listener_counts
+from zbridge.hq.context import Bridge, ListenerContext, listener_counts
 from zbridge.hq.freeze import FROZEN, FreezeWatch
 from zbridge.hq.handover import ListenerHandover
 from zbridge.hq.listener_log import ConnectionLog, FailureLog

@@ -200,7 +200,7 @@ async def test_a_robot_that_was_never_reached_is_left_to_a_gateway_that_has_it(m
         shown = len(bus.values("fleet/r1/status"))
         await asyncio.sleep(10.0)
         assert len(bus.values("fleet/r1/status")) == shown, "nothing more is said of the robot"
-        assert last(bus, "status")["reason"] == "gateway stopped"
+        assert last(bus, "status")["state"] == "offline"
     assert "another gateway serves r1: leaving it alone" in caplog.text
 
 

@@ -78,8 +78,10 @@ async def test_a_robot_that_the_stop_of_all_did_not_reach_is_latched_by_name_and
 
 
 async def test_each_robot_has_its_outcome_confirmed_or_not() -> None:
-    world = World("r1", "r2", "r3")
+    world = World("r1", "r2", "r3", "r4")
     world.gateways["r2"].publish(topics.STATUS, Status(state="offline", reason="no route"))
+    stalled = "the robot's link takes nothing: it is not driven"
+    world.gateways["r4"].publish(topics.STATUS, Status(state="established", reason=f"{stalled}; another condition"))
     await world.gateways["r3"].vanish()
     world.bus.announce("fleet/r3/@alive/gateway")
     asked_at = world.loop.time()
@@ -87,6 +89,7 @@ async def test_each_robot_has_its_outcome_confirmed_or_not() -> None:
     assert world.loop.time() - asked_at < CONFIRM_S + 0.5
     assert outcomes["r1"] is None
     assert isinstance(outcomes["r2"], NotReady)
+    assert str(outcomes["r4"]) == "r4: stop taken, but it waits: the robot's link takes nothing"
     assert isinstance(outcomes["r3"], BusError)
     assert world.gateways["r2"].control.state == "latched", "its gateway keeps it"
     outcomes = await world.fleet.unlatch()
@@ -94,6 +97,7 @@ async def test_each_robot_has_its_outcome_confirmed_or_not() -> None:
         "r1": None,
         "r2": None,
         "r3": BusError,
+        "r4": None,
     }
 
 

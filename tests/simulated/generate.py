@@ -22,10 +22,16 @@ _DRIVEN = ("moving", "moving", "mode read", "drive received", "stopping", "stop 
 """The states in which a fault of the robot or its link hurts."""
 
 
-def scenario(seed: int | str, profile: str | None = None) -> dict[str, Any]:
-    """Make the scenario of a seed; profile None: the seed chooses."""
+def scenario(seed: int, profile: str | None = None) -> dict[str, Any]:
+    """Make the scenario of a seed; profile None: a situation and another profile by turns.
+
+    One seed after the other meets each situation, so that a minute has them all.
+    """
     rng = random.Random(f"scenario {seed} {profile}")
-    profile = profile or rng.choice(PROFILES)
+    turn = seed
+    if profile is None:
+        turn, other = divmod(seed, 2)
+        profile = rng.choice(PROFILES[:-1]) if other else PROFILES[-1]
     stripped = rng.random() < 1 / 3
     protocol = profile if profile in ("alf", "wc2ec") else rng.choice(("tcpudp", "tcpudp", "tcpudp", "alf", "wc2ec"))
     if profile == "tcpudp":
@@ -49,7 +55,7 @@ def scenario(seed: int | str, profile: str | None = None) -> dict[str, Any]:
     if rng.random() < 0.2 or profile == "bus":
         made["network"]["reorders"] = rng.random() < 0.3
     if profile == "situations":
-        arrange(rng, made)
+        arrange(rng, made, turn)
         return made
     steps = _acts(rng, made) + _faults(rng, made, profile)
     if profile == "restart":

@@ -22,6 +22,8 @@ from zbridge.metrics import Metrics
 
 ROBOT = "r1"
 _NOTHING = object()
+GARBLED_STOP = msgpack.packb({"id": bytes(16)}).replace(b"\x81", b"\x82") + b"\xa3who\xa2J\xf6"
+"""A stop whose text is Latin-1: whoever sends it must be heard."""
 RESTART_S = 10.0
 """Longest wait for the answer to a restart."""
 
@@ -182,7 +184,11 @@ class DriverMember(Member):
         assert self.bus is not None
         fleet = self._fleet()
         robot = fleet[ROBOT]
-        if step["do"] == "stop":
+        if step["do"] in ("light", "garbled stop"):
+            light, payload = step["do"] == "light", msgpack.packb({"on": True})
+            key = f"fleet/{ROBOT}/@cmd/{'light' if light else 'stop'}"
+            self.bus.put(key, payload if light else GARBLED_STOP, None, droppable=False)
+        elif step["do"] == "stop":
             await robot.stop()
         elif step["do"] == "latch" and step.get("fleet"):
             if (await fleet.latch()).get(ROBOT, _NOTHING) is not None:

@@ -187,4 +187,68 @@ FOUND = (
         "        if latch.id in self._released or latch.id in self._released_fleet:\n",
         "        if latch.id in self._released_fleet:\n",
     ),
+    _mutant(
+        "the baseline of an age rises from the first command on",
+        "zbridge/control/holders.py",
+        "            self._baseline_ms = apart_ms\n"
+        "        else:\n"
+        "            risen_ms = self._baseline_ms + (received_ms - self._sampled_ms) / 1000 * RISES_MS_PER_S\n"
+        "            self._baseline_ms = min(apart_ms, risen_ms)\n"
+        "        self._sampled_ms = received_ms\n",
+        "            self._baseline_ms = apart_ms\n"
+        "            self._sampled_ms = received_ms\n"
+        "        else:\n"
+        "            risen_ms = self._baseline_ms + (received_ms - self._sampled_ms) / 1000 * RISES_MS_PER_S\n"
+        "            self._baseline_ms = min(apart_ms, risen_ms)\n",
+    ),
+    _mutant(
+        "a listener declares no liveliness token",
+        "zbridge/lease/lease_holder.py",
+        "            self.announce()\n            self._spawn(self._ask(question))\n",
+        "            self._spawn(self._ask(question))\n",
+    ),
+    _mutant(
+        "a stop of a robot that its gateway tries to reach counts as confirmed",
+        "zbridge/client/stops.py",
+        '    if isinstance(status, Status) and status.state != "established":',
+        '    if isinstance(status, Status) and status.state == "offline":',
+    ),
+    _mutant(
+        "a yielded gateway serves the robot when its bus is cut",
+        "zbridge/robot/ownership.py",
+        "        if self._bus_gone:\n            return False\n        self._looks -= 1\n",
+        "        self._looks -= 1\n",
+    ),
+    _mutant(
+        "motion does not call off the wait for a neutral",
+        "zbridge/hq/intent.py",
+        "        self.expire(now)\n"
+        "        self._rests_at = math.inf\n"
+        '        if self.mode == "none" and self.needs_neutral is None:\n',
+        '        self.expire(now)\n        if self.mode == "none" and self.needs_neutral is None:\n',
+    ),
+    _mutant(
+        "a gateway that serves its robot again forgets the owner's latched stops",
+        "zbridge/app/serving.py",
+        "        self._device.merge(self._owners_record)\n        await self._device.step_in()\n",
+        "        await self._device.step_in()\n",
+    ),
+    _mutant(
+        "a stopped vehicle repeats its motion with another light",
+        "gateways/alf/translate.py",
+        "        self._send(self._neutral(), now, urgent=True)\n",
+        "        if self._session is None:\n"
+        '            raise NotReady("offline")\n'
+        "        self._session.drive(self._neutral(), now, urgent=True)\n",
+    ),
+    _mutant(
+        "a text that is no UTF-8 raises",
+        "zbridge/fleet/payload.py",
+        "    except (msgspec.MsgspecError, ValueError, OverflowError, RecursionError) as error:\n"
+        '        raise PayloadError(f"{message.__name__}: {error}") from error\n'
+        "    return decoded\n",
+        "    except (msgspec.MsgspecError, OverflowError, RecursionError) as error:\n"
+        '        raise PayloadError(f"{message.__name__}: {error}") from error\n'
+        "    return decoded\n",
+    ),
 )

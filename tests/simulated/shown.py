@@ -32,6 +32,8 @@ class Shown:
         """By gateway, the state of its last ``status``."""
         self._reason: dict[str, str] = {}
         """By gateway, the reason that its last ``status`` gives."""
+        self._reason_at: dict[str, float] = {}
+        """By gateway, when that reason was first given."""
         self._apart_since: dict[str, float] = {}
         self._works_since: tuple[str | None, float] = (None, 0.0)
         self._latched_at = 0.0
@@ -42,6 +44,8 @@ class Shown:
         if what == "puts" and who in self._checker.gateways:
             if fields[0].endswith("/status"):
                 status = read(fields[1])
+                if str(status.get("reason")) != self._reason.get(who):
+                    self._reason_at[who] = self._world.now
                 self._state[who], self._reason[who] = str(status.get("state")), str(status.get("reason"))
             elif fields[0].endswith("/control"):
                 self._on_control(who, read(fields[1]))
@@ -72,7 +76,7 @@ class Shown:
 
     def _look_for_stalled(self, works: str | None) -> None:
         """``status`` says that a link is stalled for as long as it is."""
-        if works is None or self._world.now - self._works_since[1] < RECOVERED_S:
+        if works is None or self._world.now - max(self._works_since[1], self._reason_at.get(works, 0.0)) < RECOVERED_S:
             return
         if STALLED in self._reason.get(works, "") and self._judges(works, RECOVERED_S):
             self._checker.violate("status", f"{works} reaches its robot, and shows: {self._reason.pop(works)}")

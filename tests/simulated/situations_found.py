@@ -189,6 +189,36 @@ def _cut_after_long(rng: random.Random, made: Made) -> None:
     made["steps"] = [drive(2.0, "op1", hz=20.0, deadman_s=2.0, wiggles=rng.random() < 0.3) | {"for": t + 2.0}, cut]
 
 
+def _stop_while_away(rng: random.Random, made: Made) -> None:
+    """Somebody stops a robot that its gateway cannot reach, and tries to."""
+    _client(made)
+    made["drivers"][1] |= {"options": {}, "router": "router1"}
+    cut = fault(3.0, "cut", between=["robot", "gw1"], both=True) | {"for": 40.0}
+    reset = fault(3.1, "reset", between=["robot", "gw1"])
+    stops = [{"t": 10.0 + 2.0 * number + rng.random(), "who": "op2", "do": "stop"} for number in range(12)]
+    made["steps"] = [cut, reset, *stops]
+
+
+def _light_after_a_stop(rng: random.Random, made: Made) -> None:
+    """Somebody without a lease switches the light of a vehicle whose driver was stopped."""
+    dialect = rng.choice(("text", "binary"))
+    made["robot"] = {"protocol": "alf", "options": {"dialect": dialect}, "device": {"dialect": dialect}}
+    ends = rng.choice(("stop", "latch", "kill", ""))
+    t = rng.uniform(4.0, 5.0)
+    made["steps"] = [drive(3.0, "op1", hz=20.0, neutral=False) | {"for": t - 3.0 + (2.0 if ends else 0.0)}]
+    if ends == "kill":
+        made["steps"].append(fault(t, "kill", target="op1") | {"for": 4.0})
+    elif ends:
+        made["steps"].append({"t": t, "who": "op2", "do": ends})
+    made["steps"] += [{"t": t + after, "who": "op2", "do": "light"} for after in (0.7, 1.3, 1.9, 2.5, 3.0)]
+
+
+def _garbled_stop(rng: random.Random, made: Made) -> None:
+    """Somebody stops a driven robot with a text that is no UTF-8."""
+    made["steps"] = [drive(3.0, "op1", hz=20.0) | {"for": 8.0}]
+    made["steps"] += [{"t": rng.uniform(4.0, 7.0), "who": "op2", "do": "garbled stop"}]
+
+
 FOUND: tuple[Callable[[random.Random, Made], None], ...] = (
     _cut_when_granted,
     _cut_when_granted,
@@ -208,4 +238,7 @@ FOUND: tuple[Callable[[random.Random, Made], None], ...] = (
     _latched_while_restarting,
     _latched_late,
     _cut_after_long,
+    _stop_while_away,
+    _light_after_a_stop,
+    _garbled_stop,
 )

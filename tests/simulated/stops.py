@@ -6,6 +6,7 @@ packet 4 in ``docs/what-happens.md``.
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +24,9 @@ ASKED_S = 5.0
 """Longest time that a program takes to confirm a stop."""
 SILENCE_S = 2.5
 """Seconds after packet 4 in which a TCP/UDP robot gets nothing but a packet 7."""
+STALLED = "the robot's link takes nothing"
+SHOWN_S = 1.0
+"""Seconds after which a program that asks for ``status`` has what the gateway shows."""
 ON_ITS_WAY_S = 0.15
 """Seconds for which what was written before the gateway had the packet 4 is excused."""
 
@@ -41,6 +45,8 @@ class StopRules:
         self._works: tuple[str | None, float] = (None, 0.0)
         self._starts: dict[str, float] = {}
         """By gateway, when the robot asked it for datagrams."""
+        self._apart_since: dict[str, float] = {}
+        """By gateway, since when its ``status`` has not shown a robot that takes commands."""
 
     def watch(self, who: str, what: str, fields: tuple[Any, ...]) -> None:
         """Follow the trace."""
@@ -52,6 +58,12 @@ class StopRules:
                 self._received.add(stop_id)
         elif what == "done" and fields[0] in ("stop", "latch"):
             self._on_done(who, fields[0])
+        elif what == "puts" and who in self._checker.gateways and fields[0].endswith("/status"):
+            status = read(fields[1])
+            if status.get("state") == "established" and STALLED not in (status.get("reason") or ""):
+                self._apart_since[who] = math.inf
+            elif self._apart_since.get(who, math.inf) == math.inf:
+                self._apart_since[who] = self._world.now
         elif (who, what) == ("robot", "connected"):
             self._starts.pop(self._checker.by_host.get(fields[0][0], ""), None)
         elif (who, what) == ("robot", "starts datagrams"):
@@ -65,6 +77,8 @@ class StopRules:
         self._checker.counts[f"{what} confirmed"] += 1
         if sent and not sent & self._received:
             self._checker.violate("confirmed", f"{who} was told that its {what} was done, which no gateway received")
+        if max(self._apart_since.values(), default=math.inf) < self._world.now - SHOWN_S:
+            self._checker.violate("confirmed", f"{who} was told that its {what} was done, and the robot was away")
 
     def _look_at_silence(self, gateway: str, data: bytes) -> None:
         begun, now = self._starts[gateway], self._world.now

@@ -15,6 +15,7 @@ from zbridge.client.driver import default_who
 from zbridge.client.stops import Outcome
 from zbridge.errors import BusError, NotReady, Refused
 from zbridge.fleet import topics
+from zbridge.fleet.messages import LINK_BLOCKED
 from zbridge.fleet.printable import shown
 from zbridge.fleet.topics import KeySpace, is_name, split_key
 
@@ -71,7 +72,7 @@ def summary(outcomes: Mapping[str, Outcome], done: str) -> str:
 
 def _finding(error: Exception) -> str:
     if isinstance(error, NotReady):
-        return "offline"
+        return "not reached" if LINK_BLOCKED in str(error) else "offline"
     return "refused" if isinstance(error, Refused) else "did not confirm"
 
 

@@ -21,7 +21,7 @@ from zbridge.bus.tls.membership import Right, lacking
 from zbridge.errors import BusError, BusRefused, NotReady, PayloadError, Refused, refusal
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Control, Latch, Refusal, Status, Stop, Unlatch
+from zbridge.fleet.messages import LINK_BLOCKED, Control, Latch, Refusal, Status, Stop, Unlatch
 from zbridge.fleet.topics import KeySpace, Topic
 
 REPEAT_S = 0.25
@@ -67,7 +67,7 @@ async def stop_robot(bus: Bus, keys: KeySpace, stop: Stop) -> None:
     """Stop a robot and return when its gateway has confirmed it.
 
     Raises BusError if no gateway does within CONFIRM_S, Refused if the robot cannot be stopped, NotReady if its gateway
-    has no connection to it.
+    has no connection to it, or one that takes nothing.
     """
     await put_stop(bus, keys, stop)  # before anything that may take time
     control = await _shown(bus, keys, stop, lambda control: stop.id in control.stops, CONFIRM_S)
@@ -86,6 +86,8 @@ async def stop_robot(bus: Bus, keys: KeySpace, stop: Stop) -> None:
     if isinstance(status, Status) and status.state != "established":
         why = status.reason or "no reason known"
         raise NotReady(f"{keys.robot}: stop taken, but the robot is {status.state}: {why}")
+    if isinstance(status, Status) and LINK_BLOCKED in (status.reason or ""):
+        raise NotReady(f"{keys.robot}: stop taken, but it waits: {LINK_BLOCKED}")
 
 
 async def stop_robots(bus: Bus, realm: str, robots: Iterable[str], stop: Stop) -> dict[str, Outcome]:

@@ -175,6 +175,10 @@ class LinkStatus(msgspec.Struct, frozen=True):
 RobotState = Literal["offline", "connecting", "handshaking", "established", "closing"]
 
 
+LINK_BLOCKED = "the robot's link takes nothing"
+"""Stands in the reason of a :class:`Status` while nothing that is written reaches the robot."""
+
+
 class Status(FleetMessage, frozen=True):
     """Whether the robot can be used, and what was negotiated with it. host: the machine of its gateway."""
 

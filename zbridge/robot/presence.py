@@ -12,9 +12,9 @@ from zbridge.control.enforcer import Enforcer
 from zbridge.control.standstill import Standstill
 from zbridge.errors import Refused
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Status
+from zbridge.fleet.messages import LINK_BLOCKED, Status
 from zbridge.protocol.session import Session, State
-from zbridge.robot.commands import LINK_BLOCKED, Commands
+from zbridge.robot.commands import Commands
 from zbridge.robot.connection import Links
 from zbridge.robot.queries import PendingQueries
 

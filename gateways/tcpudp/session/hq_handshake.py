@@ -224,8 +224,9 @@ class HqHandshake(PacketSession):
         self._handshake.fire(HqEvent.SETTINGS_UDP if udp else HqEvent.SETTINGS_TCP, now)
 
     def _take_answer(self, *, works: bool, now: float) -> None:
+        repeated = works and self._answered is True  # the network may deliver a datagram twice
         self._answered = self._answered or works
-        if not self._handshake.fire(HqEvent.WORKS if works else HqEvent.FAILS, now):
+        if not repeated and not self._handshake.fire(HqEvent.WORKS if works else HqEvent.FAILS, now):
             raise ProtocolError("serverUDPConnection was not due")
 
     # Actions of the table

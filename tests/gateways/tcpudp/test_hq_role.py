@@ -197,6 +197,13 @@ def test_an_answer_that_is_none_is_counted_and_waited_past() -> None:
     assert timed.hear("0.4 u6+").told() == "0.1 t3 0.2 u5 0.4 t7+"
 
 
+def test_an_answer_that_the_network_delivers_again_is_no_sign_of_a_bad_connection() -> None:
+    timed = probed("0.3 u6+ 0.31 u6+ 0.32 u6+ 0.4 u6+")
+    assert timed.told() == "0.1 t3 0.2 u5 0.3 t7+"
+    assert timed.session.traffic.malformed == 0
+    assert timed.hear("0.5 t6-").session.traffic.malformed == 1, "an answer that says otherwise"
+
+
 def test_datagrams_hold_one_packet_each_and_are_taken_from_the_robot_although_the_probe_failed() -> None:
     """What an HQ announces never limits what a robot may send it."""
     for timed in (probed("0.3 u6+"), probed()):

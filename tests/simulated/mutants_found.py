@@ -216,7 +216,7 @@ FOUND = (
     _mutant(
         "a yielded gateway serves the robot when its bus is cut",
         "zbridge/robot/ownership.py",
-        "        if self._bus_gone:\n            return False\n        self._looks -= 1\n",
+        "        if self._bus.gone:\n            return False\n        self._looks -= 1\n",
         "        self._looks -= 1\n",
     ),
     _mutant(

@@ -219,6 +219,25 @@ def _garbled_stop(rng: random.Random, made: Made) -> None:
     made["steps"] += [{"t": rng.uniform(4.0, 7.0), "who": "op2", "do": "garbled stop"}]
 
 
+def _yielded_without_bus(rng: random.Random, made: Made) -> None:
+    """Two gateways serve the robot, and meet; then one of them loses its bus, while the robot is driven."""
+    tcpudp(rng, made)
+    steps = split(rng, made, t=3.5, s=rng.uniform(9.0, 11.0))
+    t = 3.5 + steps[0]["for"] + rng.uniform(5.0, 6.0)
+    steps += [drive(t - 1.0, who) | {"for": 8.0} for who in ("op1", "op2")]
+    made["steps"] = [*steps, fault(t, "unlink", target=rng.choice(("gw1", "gw2"))) | {"for": rng.uniform(3.0, 8.0)}]
+
+
+def _latched_and_owner_gone(rng: random.Random, made: Made) -> None:
+    """Two gateways serve the robot, and meet; it is latched, and the one that serves it is killed."""
+    tcpudp(rng, made)
+    steps = split(rng, made, t=3.5, s=rng.uniform(9.0, 11.0))
+    t = 3.5 + steps[0]["for"] + 5.0
+    latches = [{"t": t, "who": who, "do": "latch"} for who in ("op1", "op2")]
+    made["steps"] = [*steps, *latches, fault(t + rng.uniform(1.5, 3.0), "kill", target="owner") | {"for": 30.0}]
+    made["steps"] += [drive(t + after, who) for after in (6.0, 9.0) for who in ("op1", "op2")]
+
+
 FOUND: tuple[Callable[[random.Random, Made], None], ...] = (
     _cut_when_granted,
     _cut_when_granted,
@@ -241,4 +260,6 @@ FOUND: tuple[Callable[[random.Random, Made], None], ...] = (
     _stop_while_away,
     _light_after_a_stop,
     _garbled_stop,
+    _yielded_without_bus,
+    _latched_and_owner_gone,
 )

@@ -23,6 +23,8 @@ ASIDE_S = 1.3
 """Longest time until a gateway that leaves its robot to another one has stopped it."""
 BACK_S = 0.5
 """Longest time until a gateway that serves its robot again has stopped it."""
+BUS_NOTICED_S = 0.3
+"""Seconds after which a gateway knows that its bus is gone."""
 STOPPED_ONCE_S = 0.5
 """A gateway that left its robot to another one so long ago has written the one stop, and writes no more."""
 
@@ -51,6 +53,8 @@ class Written:
         """Gateways that left a moving robot to another one."""
         self._left_at: dict[str, float] = {}
         """By gateway, when it left the robot to another one."""
+        self._bus_lost_at: dict[str, float] = {}
+        """By host, when its link to the router was lost, until it is back."""
         self._back: set[str] = set()
         """Gateways that serve the robot again, and have not stopped it."""
         self._connected_at = 0.0
@@ -71,11 +75,16 @@ class Written:
         elif what == "announces" and fields[0].endswith("/@alive/gateway"):
             if self._left_at.pop(who, None) is not None:
                 self._on_back(who)
+                self._look_for_a_bus(who)
             if who in self._aside:
                 self._aside.discard(who)
                 self._owes[who] = "since it serves the robot again"
         elif what in ("killed", "ended", "started", "took over"):
             self._left_at.pop(who, None)
+        elif (who, what) == ("bus", "link lost") and fields[2] == 0:
+            self._bus_lost_at[fields[0]] = self._world.now
+        elif (who, what) == ("bus", "link back"):
+            self._bus_lost_at.pop(fields[0], None)
 
     def written(self, gateway: str, data: bytes) -> None:
         """Take what a gateway wrote."""
@@ -149,6 +158,12 @@ class Written:
                 self._checker.violate("stop-aside", f"{gateway} left the robot to another gateway, and moving")
 
         self._world.after(ASIDE_S, look)
+
+    def _look_for_a_bus(self, gateway: str) -> None:
+        """Whoever left the robot to another gateway cannot know that it is gone, while its own bus is."""
+        lost_at = self._bus_lost_at.get(self._checker.gateways[gateway].host.name, self._world.now)
+        if self._world.now - lost_at > BUS_NOTICED_S:
+            self._checker.violate("aside", f"{gateway} serves the robot again, and has no bus")
 
     def _on_back(self, gateway: str) -> None:
         """A gateway that serves its robot again begins with a stop."""

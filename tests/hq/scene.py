@@ -16,7 +16,6 @@ import numpy as np
 
 from tests.hq.gateway import KEYS, Gateway
 from zbridge.bus.fake import FakeBus
-from zbridge.control.context import Clocks
 from zbridge.errors import EncodeError, ProtocolError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -27,6 +26,7 @@ from zbridge.hq import listener as listeners
 from zbridge.hq.listener import Listener
 from zbridge.hq.robot_subscription import RobotSubscription
 from zbridge.hq.settings import HqSettings, ListenerPlan
+from zbridge.lease.clocks import Clocks
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.protocol.plugin import HqSide, Protocol, Send, Telemetry

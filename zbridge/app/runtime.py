@@ -19,7 +19,8 @@ from zbridge.app.handover.processes import PROCESSES, Processes
 from zbridge.app.joining import can_connect, join_bus
 from zbridge.bus import Bus
 from zbridge.control.audit_log import Audit, AuditFile
-from zbridge.control.context import Clocks, Conditions
+from zbridge.control.context import Conditions
+from zbridge.lease.clocks import Clocks
 from zbridge.metrics import Metrics
 from zbridge.transport.kernel import KERNEL, Kernel
 

@@ -17,10 +17,11 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Acquire, Control, Drive, FleetMessage, Mode, Motor, Raw, Refusal
 from zbridge.fleet.topics import KeySpace, Topic
+from zbridge.lease.clocks import raw_ms
 from zbridge.lease.commands import CommandPublishers
 from zbridge.lease.lease_client import LeaseClient
 from zbridge.lease.lease_events import NAMED, LeaseEvent, LeaseEventKind
-from zbridge.lease.lease_holder import LeaseHolder, raw_ms
+from zbridge.lease.lease_holder import LeaseHolder
 
 REPEAT_S = 0.05
 """Seconds between the commands of :meth:`Driver.during`."""

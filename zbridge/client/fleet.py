@@ -41,7 +41,7 @@ from zbridge.fleet.messages import (
     Text,
 )
 from zbridge.fleet.topics import KeySpace, Topic, escape, is_name, split_key, unescape
-from zbridge.lease.lease_holder import raw_ms
+from zbridge.lease.clocks import raw_ms
 
 T = TypeVar("T")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable
 
 import msgspec
@@ -12,7 +11,7 @@ from zbridge.bus import Bus
 from zbridge.errors import FAULT, Unsupported, describe
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import KeySpace, Topic
-from zbridge.lease.lease_holder import raw_ms
+from zbridge.lease.clocks import raw_ms, suspended_s
 from zbridge.metrics import Metrics
 from zbridge.protocol.plugin import RobotSide
 
@@ -20,31 +19,6 @@ log = logging.getLogger("zbridge.robot.commands")
 
 LOGGED = 16
 """Faults that are logged, each once."""
-_BOOT = getattr(time, "CLOCK_BOOTTIME", None)
-
-
-def suspended_s() -> float:
-    """Return for how many seconds this machine was suspended since it was booted; 0 where the platform does not say.
-
-    The result may be too small by the time between two readings, never too large.
-    """
-    if _BOOT is None:
-        return 0.0
-    since_boot = time.clock_gettime(_BOOT)
-    return since_boot - time.monotonic()
-
-
-class Clocks(msgspec.Struct, frozen=True):
-    """The clocks of one machine.
-
-    clock: seconds on the time line of event loops, from any thread. clock_ns: Unix time. raw_ms, suspended_s: see the
-    functions.
-    """
-
-    clock: Callable[[], float] = time.monotonic
-    clock_ns: Callable[[], int] = time.time_ns
-    raw_ms: Callable[[], float] = raw_ms
-    suspended_s: Callable[[], float] = suspended_s
 
 
 class Conditions:
@@ -105,7 +79,7 @@ class RobotContext(msgspec.Struct, frozen=True):
 
     publish: shows a message on the bus. pump: writes to the robot what its sessions have to write.
     clock: seconds on the event loop's time line, from any thread. clock_ns: Unix time in nanoseconds, for stamps.
-    raw_ms, suspended_s: see the functions.
+    raw_ms, suspended_s: see :mod:`zbridge.lease.clocks`.
     """
 
     robot: RobotSide

@@ -13,7 +13,6 @@ import logging
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from zbridge.control.context import Clocks
 from zbridge.hq.admission import FULL, Admission
 from zbridge.hq.broadcast import Broadcast
 from zbridge.hq.client import SWEEP_S, Client
@@ -25,6 +24,7 @@ from zbridge.hq.refusals import RefusalReports
 from zbridge.hq.robot_queries import RobotQueries
 from zbridge.hq.robot_subscription import RobotSubscription
 from zbridge.hq.settings import ListenerPlan
+from zbridge.lease.clocks import Clocks
 from zbridge.metrics import Metrics
 from zbridge.protocol.kept import Exported
 from zbridge.protocol.plugin import ATTEND_S

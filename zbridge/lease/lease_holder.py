@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import time
 from collections.abc import Callable, Coroutine
 from typing import Any
 
@@ -15,13 +14,6 @@ from zbridge.errors import BusError
 from zbridge.fleet.messages import Control, Refusal
 from zbridge.lease.lease_client import LeaseClient, Question
 from zbridge.lease.lease_events import LeaseEvent, LeaseState
-
-_RAW = getattr(time, "CLOCK_MONOTONIC_RAW", time.CLOCK_MONOTONIC)
-
-
-def raw_ms() -> float:
-    """Return milliseconds of CLOCK_MONOTONIC_RAW, which no time service slews; from any thread."""
-    return time.clock_gettime_ns(_RAW) / 1e6
 
 
 class LeaseHolder:

@@ -19,7 +19,7 @@ import msgspec
 from zbridge.bus import Bus, Handle
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
-from zbridge.control.context import Conditions, Faults, RobotContext, suspended_s
+from zbridge.control.context import Conditions, Faults, RobotContext
 from zbridge.control.enforcer import Enforcer, Save
 from zbridge.control.latch import Latches, LatchRecord
 from zbridge.control.lease_server import LeaseServer
@@ -27,7 +27,7 @@ from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import IDLE_STOP_S, STOP_REPEAT_S, Standstill
 from zbridge.errors import BusError, NotReady, Refused, Unsupported
 from zbridge.fleet.topics import KeySpace
-from zbridge.lease.lease_holder import raw_ms
+from zbridge.lease.clocks import raw_ms, suspended_s
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import DeviceAddress
 from zbridge.protocol.kept import Budget, Exported
@@ -100,7 +100,7 @@ class Device(Transferable):
         """Begin. share: of the processor, where the process serves other robots too.
 
         shared_address: gateways of other robots may connect to the same addresses. clock: seconds on the event loop's
-        time line. clock_ns: Unix time. raw_ms, suspended_s: see :mod:`zbridge.control.context`. keep_latches: writes
+        time line. clock_ns: Unix time. raw_ms, suspended_s: see :mod:`zbridge.lease.clocks`. keep_latches: writes
         the latched stops down. chance: 0 to 1. attach: attaches a connection that another process handed over.
         """
         loop = asyncio.get_running_loop()

@@ -23,13 +23,13 @@ from tests.clock import scene_of
 from tests.gateways.tcpudp.frames import ANSWER_TRUE, LISTED, START, bearing, client_settings, framed
 from tests.hq.gateway import KEYS, Gateway
 from zbridge.bus.fake import FakeBus
-from zbridge.control.context import Clocks
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, Status
 from zbridge.hq.listener import Listener
 from zbridge.hq.robot_subscription import RobotSubscription
 from zbridge.hq.settings import HqSettings, ListenerPlan
+from zbridge.lease.clocks import Clocks
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.protocol.session_table import SessionTable

@@ -65,7 +65,7 @@ class FleetRules:
     def _not_learnt(self, gateway: str) -> set[bytes]:
         """The latched stops that others knew when a gateway came to the bus, and that it has not shown yet."""
         since = self._here_since.get(gateway, float("inf"))
-        if not self._checker.obligations.calm_since(since):
+        if since == float("inf") or not self._checker.obligations.calm_since(since):  # it does not know of its bus yet
             return set()
         return {
             stop_id

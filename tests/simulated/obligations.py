@@ -76,6 +76,8 @@ class Obligations:
             self._disturbed[who] = self._calm_from = self.world.now
         elif what in DISTURBS:
             self._disturbed[who] = self._calm_from = self.world.now
+        elif what == "killed":  # one of the two processes of a restart
+            self._tokens.pop(who, None)
         elif what == "took over":
             has_token = self._tokens.pop(f"{who}+", float("inf")) <= self.world.now
             self._tokens[who] = self.world.now if has_token else float("inf")
@@ -111,7 +113,8 @@ class Obligations:
         self._control[gateway] = control
         last = self.checker.current.get(gateway)
         if last is not None and last.shown and control.get("lease") != last.lease:
-            self._ended_unexplained(last)
+            if not control.get("latches"):  # one that it learnt from others ends a lease, too
+                self._ended_unexplained(last)
             self.checker.end(gateway, "as control says")
         grant = self.checker.grants.get(control.get("lease") or b"")
         if grant is None:

@@ -19,6 +19,8 @@ GONE_S = 0.8
 """Longest time until the lease of an HQ program that disconnected is given back."""
 FROZEN_S = 0.9
 """A listener that did not run for so long asks its programs for a neutral: it looks every 0.1 s, for 0.6 s."""
+SILENT_S = 1.8
+"""A silence that is longer than the deadman of each HQ program."""
 ORDER_S = 0.1
 """What a program says so long after something else arrives after it, by stream and by datagram."""
 AWAY_S = 0.8
@@ -49,6 +51,10 @@ class Released:
         """Programs that pushed while no gateway served the robot, and have not said neutral since."""
         self._served_at = 0.0
         """When a gateway that serves the robot was last there."""
+        self._cut_at: dict[str, float] = {}
+        """By program, when what it sends to its listener was cut off."""
+        self._silent: dict[str, float] = {}
+        """By program, when its network was back after a silence in which it pushed."""
         self._frozen: dict[str, float] = {}
         """By program, when its listener ran again after a freeze in which the program pushed."""
 
@@ -64,8 +70,11 @@ class Released:
             self._mode[who], self._spoke_at[who] = fields[0], self._world.now
         elif what == "lost listener" and who == self._only:
             self._on_gone(who)
+        elif who == "paths":
+            self._on_path(what, fields)
         elif what == "connected to listener":
             self._mode.pop(who, None)
+            self._silent.pop(who, None)
             self._frozen.pop(who, None)
             self._refused.discard(who)
         elif what == "paused" and who in self._checker.gateways:
@@ -75,6 +84,19 @@ class Released:
             self._frozen |= {
                 each.name: self._world.now for each in self._simulation.programs if each.address[0] == host
             }
+
+    def _on_path(self, what: str, fields: tuple[Any, ...]) -> None:
+        """A program that was cut off while it pushed, for longer than its deadman, says neutral then."""
+        for program in self._simulation.programs:
+            way, name = (program.host.name, program.address[0]), program.name
+            if what == "cut" and (fields[:2] == way or (fields[2] and fields[:2] == way[::-1])):
+                self._silent.pop(name, None)
+                if self._checker.said_last(name):
+                    self._cut_at[name] = self._world.now
+            elif what == "healed" and set(fields) == set(way) and name in self._cut_at:
+                silent_s = self._world.now - self._cut_at.pop(name)
+                if silent_s > SILENT_S and self._checker.said_last(name):
+                    self._silent[name] = self._world.now
 
     def granted(self, grant: Grant, taken_at: float | None, gives: Mapping[str, Iterable[tuple[float, float]]]) -> None:
         """An HQ program whose robot was taken says neutral before it drives again."""
@@ -88,6 +110,13 @@ class Released:
         if program in self._refused:
             self._refused.discard(program)
             self._checker.violate("hq-neutral", f"{program} pushed while the robot was away, and moves it by that")
+        healed_at = self._silent.get(program)
+        if healed_at is not None and any(not value and at > healed_at for at, value in gives):
+            del self._silent[program]
+        elif healed_at is not None:
+            self._checker.violate(
+                "hq-neutral", f"{program} pushes since before it was heard again, and moves the robot"
+            )
         since = self._frozen.get(program)
         if since is None:
             return

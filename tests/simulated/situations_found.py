@@ -125,12 +125,13 @@ def _wiggled_over_a_short_cut(rng: random.Random, made: Made) -> None:
     gateway, t = stick(rng, made, alone=rng.random() < 0.5), 5.0
     protocol = "alf" if made["robot"]["protocol"] == "alf" else rng.choice(("alf", "wc2ec"))
     gateway["hq"], made["programs"][0]["protocol"] = [protocol], protocol
-    cut_s = rng.uniform(1.2, 2.4)
+    cut_s = rng.uniform(1.4, 2.6)
     cut = fault(t, "cut", between=["desk1", gateway["host"]], both=True) | {"for": cut_s}
     made["steps"] = [drive(3.5, "stick1") | {"for": 1.8}, cut]
-    while t < 5.0 + cut_s - 0.3:
+    while t < 5.0 + cut_s - 1.2:
         t += rng.uniform(0.35, 0.6)
         made["steps"].append(drive(t, "stick1") | {"for": rng.uniform(0.1, 0.2)})
+    made["steps"].append(drive(5.0 + cut_s - rng.uniform(0.1, 0.3), "stick1") | {"for": 2.5})
 
 
 def _both_drive_and_meet(rng: random.Random, made: Made) -> None:

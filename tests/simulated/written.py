@@ -161,8 +161,9 @@ class Written:
 
     def _look_for_a_bus(self, gateway: str) -> None:
         """Whoever left the robot to another gateway cannot know that it is gone, while its own bus is."""
-        lost_at = self._bus_lost_at.get(self._checker.gateways[gateway].host.name, self._world.now)
-        if self._world.now - lost_at > BUS_NOTICED_S:
+        member = self._checker.gateways[gateway]
+        lost_at = self._bus_lost_at.get(member.host.name, self._world.now)
+        if not member.session.link.up and self._world.now - lost_at > BUS_NOTICED_S:
             self._checker.violate("aside", f"{gateway} serves the robot again, and has no bus")
 
     def _on_back(self, gateway: str) -> None:

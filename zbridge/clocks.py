@@ -1,8 +1,11 @@
-"""Clocks of this machine that Python has no function for."""
+"""The clocks of one machine, also those that Python has no function for."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+
+import msgspec
 
 _RAW = getattr(time, "CLOCK_MONOTONIC_RAW", time.CLOCK_MONOTONIC)
 _BOOT = getattr(time, "CLOCK_BOOTTIME", None)
@@ -22,3 +25,16 @@ def suspended_s() -> float:
         return 0.0
     since_boot = time.clock_gettime(_BOOT)
     return since_boot - time.monotonic()
+
+
+class Clocks(msgspec.Struct, frozen=True):
+    """The clocks of one machine.
+
+    clock: seconds on the time line of event loops, from any thread. clock_ns: Unix time. raw_ms, suspended_s: see the
+    functions.
+    """
+
+    clock: Callable[[], float] = time.monotonic
+    clock_ns: Callable[[], int] = time.time_ns
+    raw_ms: Callable[[], float] = raw_ms
+    suspended_s: Callable[[], float] = suspended_s

@@ -23,12 +23,13 @@ from tests.proofs import lease
 from zbridge.bus import Answer, Handle, Publisher, Sample
 from zbridge.bus.fake import FakeBus
 from zbridge.client import Driver, Fleet, Robot
-from zbridge.client.driver import RETRY_S, default_who
+from zbridge.client.driver import default_who
 from zbridge.errors import BusError, Code, Held, LeaseLost, Malformed, NeutralFirst, NotReady, Refused, Unsupported
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, Drive, Lease, Mode, Motor, Raw
 from zbridge.fleet.topics import Congestion, Topic
+from zbridge.lease.lease_client import RETRY_S
 
 pytestmark = pytest.mark.jumping
 

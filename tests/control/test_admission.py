@@ -141,7 +141,9 @@ def test_every_stop_is_let_through_until_one_was_carried_out_just_now(key: str) 
     assert rig.command(None, key=key) is PriorityClass.STOP
 
 
-@pytest.mark.parametrize("happens", [Rig.grant, lambda rig: rig.authority.sent_opaque()], ids=["acquired", "moves"])
+@pytest.mark.parametrize(
+    "happens", [Rig.grant, lambda rig: rig.authority.motion.sent_opaque()], ids=["acquired", "moves"]
+)
 def test_a_stop_right_after_a_stop_is_let_through_where_the_robot_is_held_or_may_move_again(happens) -> None:
     rig = Rig()
     rig.authority.stop("stop")

@@ -12,6 +12,7 @@ import pytest
 from tests.proofs import numbered, proof, shown
 from tests.tables import documented, executed
 from zbridge.control.authority import Authority
+from zbridge.control.authority_machine import AuthorityMachine
 from zbridge.control.holders import ENDED
 from zbridge.errors import Code, Held, LeaseLost, NeutralFirst, Refused
 from zbridge.fleet.messages import Acquire, Authorization, Control, Lease, Refusal
@@ -92,7 +93,7 @@ STATES: dict[str, tuple[str, list[Does]]] = {
     "released": ("free", [acquired, question("release")]),
     "held": ("held", [acquired]),
     "moving": ("held", [acquired, MOTION]),
-    "by itself": ("held", [acquired, lambda authority: authority.mode_chosen(autonomous=True)]),
+    "by itself": ("held", [acquired, lambda authority: authority.motion.mode_chosen(autonomous=True)]),
     "needs neutral": ("held", [acquired, MOTION, expire(WAIT_S)]),
     "stopped": ("stopped", [acquired, MOTION, stop]),
 }
@@ -108,14 +109,14 @@ def made(state: str) -> Authority:
         does(authority)
     authority.events()
     assert authority.state == STATES[state][0]
-    assert authority.moving is (state in IN_MOTION)
+    assert authority.motion.moving is (state in IN_MOTION)
     return authority
 
 
 def seen(authority: Authority) -> tuple[object, ...]:
     """What must not change where something is refused."""
     lease = authority.verifier.lease if authority.verifier is not None else None
-    return authority.state, authority.moving, authority.driven, authority.deadline(), lease
+    return authority.state, authority.motion.moving, authority.motion.driven, authority.deadline(), lease
 
 
 def told(authority: Authority) -> list[str]:
@@ -132,11 +133,11 @@ def refused(authority: Authority, attachment: bytes | None, at: float = 0.0) -> 
 
 def must_be_neutral(authority: Authority, why: str) -> None:
     with pytest.raises(NeutralFirst, match=f"^{why}: send a neutral drive first$"):
-        authority.check_motion()
+        authority.motion.check_motion()
 
 
 def test_the_table_of_the_documentation_is_the_one_that_is_executed() -> None:
-    assert documented("control.md", "input") == executed(Authority.TABLE)
+    assert documented("control.md", "input") == executed(AuthorityMachine.TABLE)
 
 
 # The lease
@@ -157,7 +158,7 @@ def test_a_free_robot_a_higher_priority_and_a_takeover_are_granted_and_need_no_n
     ended = [f"ended ann (taken over by bob){STOPS if state in IN_MOTION else ''}"] if state in HELD else []
     assert told(authority) == [*ended, "taken over bob" if name == "takeover" else "acquired bob"]
     assert seen(authority) == ("held", False, False, NOW + LEASE_S, given.lease)
-    authority.check_motion()
+    authority.motion.check_motion()
     assert command(attach(given, 0))(authority) == "bob", "numbers begin anew, from anywhere"
 
 
@@ -217,7 +218,7 @@ def test_a_program_whose_grant_was_lost_asks_again_and_gets_another_lease_in_pla
     assert again.lease != first.lease
     assert authority.report(NOW + 1.0).lease == again.lease
     assert told(authority) == ["ended ann (taken over by ann)", "acquired ann"], "the robot was at rest"
-    authority.check_motion()
+    authority.motion.check_motion()
     with pytest.raises(LeaseLost):
         authority.admit(attach(ANN, SEQ), DRIVE, PAYLOAD, NOW + 1.0)
 
@@ -284,7 +285,7 @@ def test_whenever_a_lease_ends_what_moves_is_stopped_and_its_holder_drives_no_mo
     ask("acquire")(authority)
     assert str(refused(authority, attach(ANN, SEQ + 2))) == f"the lease has ended ({why})"
     assert command(attach(BOB, 0))(authority) == "bob"
-    authority.check_motion()
+    authority.motion.check_motion()
 
 
 @pytest.mark.parametrize("state", NOT_HELD)
@@ -446,10 +447,10 @@ def test_holding_back_keeps_the_lease_and_demands_neutral(state: str, why: str, 
     who = " ann" if state in HELD else ""
     assert told(authority) == (3 if stops else 1) * [f"stopped{who} ({why}){STOPS if stops else ''}"], "always stops"
     assert authority.state == STATES[state][0]
-    assert not authority.moving
+    assert not authority.motion.moving
     must_be_neutral(authority, why)
     ask("takeover")(authority)
-    authority.check_motion()
+    authority.motion.check_motion()
 
 
 def test_only_a_neutral_that_was_carried_out_allows_motion_again() -> None:
@@ -458,10 +459,10 @@ def test_only_a_neutral_that_was_carried_out_allows_motion_again() -> None:
         does(authority)
         must_be_neutral(authority, "deadman")
     NEUTRAL(authority)
-    authority.check_motion()
+    authority.motion.check_motion()
     assert authority.state == "held"
     for state in ("held", "moving", "by itself"):
-        made(state).check_motion()
+        made(state).motion.check_motion()
 
 
 def test_a_robot_that_moves_for_nobody_is_stopped_before_somebody_gets_it() -> None:
@@ -469,7 +470,7 @@ def test_a_robot_that_moves_for_nobody_is_stopped_before_somebody_gets_it() -> N
     MOTION(authority)
     assert authority.acquire(Acquire(who="bob"), NOW).ok
     assert told(authority) == [f"stopped (moving without a driver when bob acquired){STOPS}", "acquired bob"]
-    assert not authority.moving
+    assert not authority.motion.moving
     assert authority.deadline() == NOW + LEASE_S
 
 
@@ -480,7 +481,7 @@ def test_the_neutral_of_a_part_that_did_not_move_allows_no_motion(stops: bool) -
     applied(moving=False, part="left motor")(authority)  # a program that drives may say this all the time
     must_be_neutral(authority, "busy")
     NEUTRAL(authority)
-    authority.check_motion()
+    authority.motion.check_motion()
 
 
 def test_each_part_that_moved_is_neutral_before_motion_or_all_at_once() -> None:
@@ -492,7 +493,7 @@ def test_each_part_that_moved_is_neutral_before_motion_or_all_at_once() -> None:
         if not whole:
             must_be_neutral(authority, "busy")
             applied(moving=False, part="left motor")(authority)
-        authority.check_motion()
+        authority.motion.check_motion()
 
 
 # Time
@@ -519,7 +520,13 @@ COURSES: dict[str, tuple[str, list[Does], list[str], bool, float | None]] = {
     "by itself there is no deadman": ("by itself", [expire(DEADMAN_S)], [], True, LEASE_S),
     "but the lease expires": ("by itself", [expire(LEASE_S)], [EXPIRED], False, None),
     "by itself only a stop makes sure": ("by itself", [NEUTRAL], [], True, LEASE_S),
-    "a raw message may move it": ("held", [Authority.sent_opaque, expire(LEASE_S)], [EXPIRED], False, None),
+    "a raw message may move it": (
+        "held",
+        [lambda authority: authority.motion.sent_opaque(), expire(LEASE_S)],
+        [EXPIRED],
+        False,
+        None,
+    ),
     "motion for nobody is watched": ("stopped", [MOTION, expire(WAIT_S)], [], True, DEADMAN_S),
     "and stopped": ("stopped", [MOTION, expire(DEADMAN_S)], [f"stopped (deadman){STOPS}"], False, None),
 }
@@ -533,7 +540,7 @@ def test_what_is_due_is_done_in_time_and_before_anything_else(state, course, eve
         with contextlib.suppress(Refused):
             does(authority)
     assert told(authority) == events
-    assert authority.moving is moves
+    assert authority.motion.moving is moves
     assert authority.deadline() == (None if due is None else NOW + due)
     if events == [DEADMAN]:
         must_be_neutral(authority, "deadman")
@@ -555,7 +562,7 @@ def test_whatever_comes_late_finds_what_was_due_done_first(what: str) -> None:
         with contextlib.suppress(Refused):
             LATE[what](at)(authority)
         assert told(authority)[0] == due
-        assert not authority.moving
+        assert not authority.motion.moving
     lease = authority.verifier.lease if authority.verifier is not None else None
     assert lease == (BOB.lease if what in ("acquire", "takeover") else None), "free for the lowest priority"
 

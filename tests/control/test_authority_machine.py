@@ -206,7 +206,7 @@ class Driving(RuleBasedStateMachine):
 
     @invariant()
     def it_moves_only_for_its_driver_and_only_in_time(self) -> None:
-        assert self.authority.moving == self.robot_moves
+        assert self.authority.motion.moving == self.robot_moves
         if not self.robot_moves:
             return
         driver, deadline = self.driver, self.authority.deadline()
@@ -278,7 +278,7 @@ class Driving(RuleBasedStateMachine):
 
     def needs_neutral(self) -> bool:
         try:
-            self.authority.check_motion()
+            self.authority.motion.check_motion()
         except Refused:
             return True
         return False
@@ -321,7 +321,7 @@ class Driving(RuleBasedStateMachine):
 
     def obey_by_itself(self) -> None:
         if not self.needs_neutral():
-            self.authority.sent_opaque()
+            self.authority.motion.sent_opaque()
             self.on_its_own = True
 
     def take_events(self, *, must_stop: bool = False) -> None:
@@ -338,7 +338,7 @@ class Driving(RuleBasedStateMachine):
                 assert not self.robot_moves, f"{event}: and the robot moves on"
             if event.stops:
                 assert event.what is not EventKind.ACQUIRED
-                assert not self.authority.moving
+                assert not self.authority.motion.moving
                 self.stand()
         assert not must_stop or any(event.stops for event in events)
         if self.driver is None:

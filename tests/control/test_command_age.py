@@ -61,7 +61,7 @@ class Ann:
         if moving and sender.stale:
             return False
         if moving:
-            self.authority.check_motion()
+            self.authority.motion.check_motion()
         self.authority.applied("drive", sender.given_at, moving=moving, stale=sender.stale)
         return True
 
@@ -138,7 +138,7 @@ def test_a_stale_neutral_ends_motion_and_leaves_the_robot_needs_neutral() -> Non
     ann.authority.require_neutral("the robot's link stalled")
     assert ann.command(1.1, 0.9, moving=False)
     with pytest.raises(NeutralFirst):
-        ann.authority.check_motion()
+        ann.authority.motion.check_motion()
     assert ann.command(2.1, moving=False)
     assert ann.command(2.2)
 
@@ -148,7 +148,7 @@ def test_a_stale_neutral_that_finds_the_robot_moving_stops_it_and_the_next_fresh
     ann.acquire()
     ann.command(1.0)
     assert ann.command(1.1, 0.9, moving=False)
-    assert not ann.authority.moving
+    assert not ann.authority.motion.moving
     assert ann.authority.deadline() == near(1.0 + WAY_S + LEASE_S), "no deadman runs"
     assert ann.command(2.1)
 
@@ -160,7 +160,7 @@ def test_a_stale_neutral_of_one_part_leaves_the_deadman_of_another_alone() -> No
     ann.authority.applied("motor/lift", 1.0, moving=True)
     before = ann.authority.deadline()
     ann.command(1.1, 0.9, moving=False)
-    assert ann.authority.moving
+    assert ann.authority.motion.moving
     assert ann.authority.deadline() == before
 
 
@@ -172,7 +172,7 @@ def test_after_a_cut_neutral_and_push_that_waited_move_nothing() -> None:
         ann.command(tick * 0.05)
     ann.authority.expire(0.95 + WAY_S + DEADMAN_S)
     with pytest.raises(NeutralFirst):
-        ann.authority.check_motion()
+        ann.authority.motion.check_motion()
     healed = 3.3
     for tick in range(20, 66):
         given_at = tick * 0.05
@@ -183,7 +183,7 @@ def test_after_a_cut_neutral_and_push_that_waited_move_nothing() -> None:
         else:
             with pytest.raises(NeutralFirst):
                 ann.command(given_at, healed - given_at)
-    assert not ann.authority.moving
+    assert not ann.authority.motion.moving
 
 
 # The baseline

@@ -93,7 +93,7 @@ async def test_motion_that_was_stopped_while_it_was_written_is_not_counted_as_mo
     rig.enforcer.require_neutral("the robot's link stalled", stops=True)
     with pytest.raises(NeutralFirst):
         rig.enforcer.moved(PATH, FORWARD, rig.now, CommandSender("a", rig.now), moving=True)
-    assert not rig.authority.moving
+    assert not rig.authority.motion.moving
 
 
 async def test_limits_refuse_what_comes_too_often_and_slow_what_grows_too_fast_from_what_was_sent() -> None:
@@ -132,14 +132,14 @@ async def test_a_stop_ends_the_lease_and_is_counted_and_shown_and_the_next_one_i
 async def test_what_may_move_a_robot_by_itself_is_noted(command: FleetMessage, moves: bool) -> None:
     rig = Rig()
     rig.enforcer.commanded(command)
-    assert rig.authority.moving is moves
+    assert rig.authority.motion.moving is moves
 
 
 async def test_after_its_end_nothing_that_still_arrives_sets_a_timer() -> None:
     scene = Rig()
     scene.enforcer.close()
     scene.shown.clear()
-    scene.enforcer.refuse("drive", NeutralFirst("the gateway has ended"), "a")
+    scene.enforcer.authority.refuse("drive", NeutralFirst("the gateway has ended"), "a")
     scene.enforcer.settle()
     await asyncio.sleep(0.2)
     assert scene.shown == []

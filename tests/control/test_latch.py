@@ -13,7 +13,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_stat
 from tests.proofs import numbered, packed
 from zbridge.control.authority import Authority
 from zbridge.control.events import EventKind
-from zbridge.control.latch import LATCHES, RELEASED, STOPS, Latches, LatchRecord, latch_of, read_stop
+from zbridge.control.latch import LATCHES, RELEASED, STOPS, Latches, LatchRecord, read_stop
 from zbridge.errors import Code, Malformed, ProtocolError, Unsupported
 from zbridge.fleet.messages import Acquire, FleetLatches, Latch, Stop
 
@@ -58,7 +58,8 @@ def test_a_stop_that_cannot_be_read_is_a_plain_stop(payload: bytes, stop: Stop) 
 
 
 def test_names_and_reasons_are_shortened() -> None:
-    kept = latch_of(Stop(latch=True, id=ID, who="w" * 500, reason="r" * 500), fleet=True)
+    kept = Latches().take(Stop(latch=True, id=ID, who="w" * 500, reason="r" * 500), fleet=True)
+    assert kept is not None
     assert (len(kept.who or ""), len(kept.reason or ""), kept.fleet) == (64, 128, True)
 
 
@@ -184,7 +185,7 @@ def test_a_latched_robot_is_stopped_and_nobody_gets_its_lease_until_the_last_id_
         (EventKind.LATCHED, "ann", True),
         (EventKind.LATCHED, "ann", True),
     ]
-    assert (authority.state, authority.moving, authority.verifier) == ("latched", False, None)
+    assert (authority.state, authority.motion.moving, authority.verifier) == ("latched", False, None)
     for ask in (authority.acquire, authority.takeover):
         refused = ask(Acquire(who="bob", priority=9), 1.0)
         assert (refused.ok, refused.code, refused.reason) == (
@@ -222,7 +223,7 @@ def test_control_shows_the_latches_and_the_last_four_stops() -> None:
     assert shown.state == "latched"
     assert shown.latches == (latch(8, fleet=True),)
     assert shown.stops == tuple(stop_id(number) for number in (4, 5, 6)), "it is not written down yet"
-    authority.latches_saved()
+    authority.latches.saved()
     shown = authority.report(0.0)
     assert shown.stops == tuple(stop_id(number) for number in (4, 5, 6, 8))
     assert len(shown.stops) == STOPS

@@ -19,7 +19,7 @@ from tests.machine import Patience
 from tests.ports import free_port
 from tests.proofs import packed
 from zbridge.app.serving import SECOND_CONNECTION
-from zbridge.robot.ownership import CLOSE_S, WATCH_S
+from zbridge.robot.claim_bus import CLOSE_S, WATCH_S
 
 CLAIM = "fleet/r1/@rpc/claim/gateway"
 TOLD = "another gateway serves this robot too: "

@@ -12,7 +12,7 @@ from tests.fleet.test_payload import PAYLOADS
 from tests.fuzz.target import Target, comparable, require_same
 from zbridge.app.handover import channel as handover
 from zbridge.control.admission import is_stop
-from zbridge.control.latch import STOPS, Latches, LatchRecord, latch_of, read_stop
+from zbridge.control.latch import STOPS, Latches, LatchRecord, read_stop
 from zbridge.errors import LinkError, Malformed, PayloadError, ProtocolError, Unsupported
 from zbridge.fleet import messages, payload, topics
 from zbridge.fleet.messages import Authorization, FleetMessage, Stop
@@ -79,13 +79,12 @@ def read_authorization(data: bytes) -> None:
 def read_stops(data: bytes) -> None:
     """Read a stop, and let it latch: a stop is never refused."""
     stop, latches = read_stop(data), Latches()
-    if isinstance(stop.id, bytes):
-        latch = latch_of(stop, fleet=bool(data[0] % 2))
-        latches.add(latch)
+    latch = latches.take(stop, fleet=bool(data and data[0] % 2))
+    if latch is not None:
         record = msgspec.msgpack.decode(msgspec.msgpack.encode(latches.record), type=LatchRecord)
         require_same("latches are read again", Latches(record).in_force, latches.in_force)
         assert latches.described
-        latches.release(stop.id, fleet=latch.fleet)
+        latches.release(latch.id, fleet=latch.fleet)
         assert not latches
     assert len(latches.in_force) <= STOPS
 

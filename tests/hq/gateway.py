@@ -65,7 +65,7 @@ class Gateway:
                 if moving and sender.stale:
                     raise Stale("too late")
                 if moving:
-                    self.authority.check_motion()
+                    self.authority.motion.check_motion()
                 if isinstance(message, Drive | Motor):
                     self.authority.applied(topic.path, sender.given_at, moving=moving, stale=sender.stale)
             except Refused as refusal:

@@ -16,6 +16,7 @@ import numpy as np
 
 from tests.hq.gateway import KEYS, Gateway
 from zbridge.bus.fake import FakeBus
+from zbridge.clocks import Clocks
 from zbridge.errors import EncodeError, ProtocolError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -224,9 +225,8 @@ class Scene:
         protocol = Protocol("toy", "", HqSettings, 1, robot=None, simulate=None, hq=self._side)  # type: ignore[arg-type]
         plan = ListenerPlan(protocol, None, Address("127.0.0.1", 0), limits, networks)
         self.accept: Callable[[], Receiver]
-        self.listener = Listener(
-            plan, "toy", self.robot, self.manager, self.metrics, lambda: self.now, clock_ms=lambda: self.now * 1000
-        )
+        clocks = Clocks(lambda: self.now, raw_ms=lambda: self.now * 1000)
+        self.listener = Listener(plan, "toy", self.robot, self.manager, self.metrics, clocks)
         self.hosts = 0
         self.programs: dict[str, Program] = {}
 

@@ -29,9 +29,10 @@ from zbridge.fleet.messages import (
     Switch,
 )
 from zbridge.fleet.view import RobotView
-from zbridge.hq.bridge import PUBLISHERS, Bridge
+from zbridge.hq.context import Bridge
 from zbridge.hq.intent import Intent
 from zbridge.hq.operator import Operator
+from zbridge.lease.commands import PUBLISHERS
 from zbridge.protocol.plugin import ATTEND_S
 
 DEADMAN_S = 1.25
@@ -408,7 +409,7 @@ async def test_mode_autonomous_keeps_the_lease_while_anything_is_heard(scene: Sc
 
 
 async def test_a_lease_shorter_than_usual_is_given_back_sooner(scene: Scene) -> None:
-    scene.authority.lease_s = 1.0
+    scene.authority.machine.lease_s = 1.0
     await scene.play(f"{DRIVES}; tick 7; held True; tick; held False")
 
 

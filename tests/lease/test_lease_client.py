@@ -20,7 +20,7 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import Acquire, Control, Lease, Refusal
 from zbridge.fleet.topics import KeySpace
 from zbridge.lease.lease_client import ASK_S, LEASE_S, LeaseClient, Question
-from zbridge.lease.lease_events import LeaseEvent, LeaseEventKind
+from zbridge.lease.lease_events import LeaseEvent, LeaseEventKind, LeaseState
 
 KEYS = KeySpace("fleet", "r1")
 NOW = 100.0
@@ -192,8 +192,8 @@ def test_what_happens_is_answered_as_the_table_says(wait_s: float | None, course
         told = program.take(step)
         assert fnmatchcase(told, follows), step
     lease = program.lease
-    assert state == ("held" if lease.held else "free" if lease.free else "asks")
-    assert not lease.free or lease.deadline() is None
+    assert state == ("held" if lease.held else "free" if lease.state is LeaseState.FREE else "asks")
+    assert lease.state is not LeaseState.FREE or lease.deadline() is None
 
 
 def test_a_question_has_a_key_a_payload_and_a_time_of_its_own() -> None:
@@ -280,7 +280,8 @@ class Holding(RuleBasedStateMachine):
             if event.kind is not LeaseEventKind.GRANTED:
                 self.wanted = False
         assert not self.lease.held or self.wanted
-        assert self.lease.free or self.wanted or self.under_way, "what is not wanted any more is being given back"
+        free = self.lease.state is LeaseState.FREE
+        assert free or self.wanted or self.under_way, "what is not wanted any more is being given back"
 
 
 def test_over_any_course_of_events_a_lease_is_held_only_while_it_is_wanted() -> None:

@@ -21,7 +21,8 @@ from zbridge.control.latch import LatchRecord
 from zbridge.fleet.messages import Latch
 from zbridge.fleet.topics import KeySpace
 from zbridge.robot.claim import LOOKS, MOST_S, RIVALS, YOUNG_S, Claim, Standing
-from zbridge.robot.ownership import ANNOUNCE_S, CLOSE_S, WATCH_S, Ownership
+from zbridge.robot.claim_bus import CLOSE_S, WATCH_S
+from zbridge.robot.ownership import ANNOUNCE_S, Ownership
 
 pytestmark = pytest.mark.jumping
 

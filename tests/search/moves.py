@@ -56,7 +56,7 @@ def moves(world: World, bounds: Bounds) -> Iterator[Move]:
 def _of_programs(world: World, bounds: Bounds) -> Iterator[Move]:
     room = len(world.net) < bounds.channel
     for number, holder in enumerate(world.holders):
-        state = holder.client._state.value
+        state = holder.client.state.value
         if room and state in ("free", "dropped", "returning"):
             yield f"{number} wants", lambda world, number=number: world.holders[number].want()
         if bounds.drops and state not in ("free", "dropped", "returning") and (room or not holder.held):
@@ -104,7 +104,7 @@ def _of_others(world: World, bounds: Bounds) -> Iterator[Move]:
         yield "the gateway cannot say" if world.ready else "it can say again", _toggle_ready
     if world.hand:
         yield "record", lambda world: world.record()
-    holder = world.authority._holders.current
+    holder = world.authority.holders.current
     if "token" in faults and holder is not None and holder.alive is not None:
         yield "token lost", lambda world: _lose_token(world)
 
@@ -142,7 +142,7 @@ def _lose_bus(world: World) -> None:
 
 
 def _lose_token(world: World) -> None:
-    holder = world.authority._holders.current
+    holder = world.authority.holders.current
     assert holder is not None
     assert holder.alive is not None
     world.authority.vanished(holder.alive)

@@ -13,7 +13,8 @@ from tests.search.bounds import LISTENER
 from tests.search.moves import Bounds
 from tests.search.search import Finding, search
 from zbridge.control.admission import SAME_STOP_S, CommandFilter
-from zbridge.control.authority import Authority
+from zbridge.control.authority_machine import AuthorityMachine
+from zbridge.control.commanded_motion import CommandedMotion
 from zbridge.control.events import AuthorityState
 from zbridge.control.holders import CommandAge, Holders
 from zbridge.lease.lease_client import LeaseClient
@@ -53,17 +54,17 @@ def _with_action(owner: Any, broken: Callable[..., Any], state_after: Any = None
     return make
 
 
-def _move(self: Authority, cause: Any) -> None:
-    self._stop_at = math.inf
+def _move(self: AuthorityMachine, cause: Any) -> None:
+    self.motion.stop_at = math.inf
 
 
-def _end(self: Authority, cause: Any) -> None:
+def _end(self: AuthorityMachine, cause: Any) -> None:
     _END(self, cause)  # and what it says of stops is left out:
-    self._events = [msgspec.structs.replace(each, stops=False) for each in self._events]
+    self.events = [msgspec.structs.replace(each, stops=False) for each in self.events]
 
 
-def _refuse_latched(self: Authority, cause: Any) -> Any:
-    return Authority._grant(self, cause)
+def _refuse_latched(self: AuthorityMachine, cause: Any) -> Any:
+    return AuthorityMachine._grant(self, cause)
 
 
 def _notify(self: LeaseClient, cause: Any) -> None:
@@ -82,7 +83,7 @@ def _ended_leases_count(self: Any, lease: bytes) -> Any:
     return _KNOWN(self, lease)
 
 
-_END, _KNOWN = Authority._end, Holders._known
+_END, _KNOWN = AuthorityMachine._end, Holders._known
 
 
 def _stop_folded_at_once(self: CommandFilter, payload: bytes) -> Any:
@@ -91,13 +92,13 @@ def _stop_folded_at_once(self: CommandFilter, payload: bytes) -> Any:
 
 _STOP = CommandFilter._stop
 MUTANTS: tuple[Broken, ...] = (
-    ("a latched robot is given away", _with_action(Authority, _refuse_latched, AuthorityState.HELD)),
-    ("no deadman", _with_action(Authority, _move)),
-    ("neutral is not required", _method(Authority, "check_motion", lambda self: None)),
-    ("an ended lease stops nothing", _with_action(Authority, _end)),
+    ("a latched robot is given away", _with_action(AuthorityMachine, _refuse_latched, AuthorityState.HELD)),
+    ("no deadman", _with_action(AuthorityMachine, _move)),
+    ("neutral is not required", _method(CommandedMotion, "check_motion", lambda self: None)),
+    ("an ended lease stops nothing", _with_action(AuthorityMachine, _end)),
     ("stale motion is obeyed", _method(CommandAge, "is_stale", _never_stale)),
-    ("an expiry is not noticed", _without_table_entry(Authority, "held", "lease expired")),
-    ("a stop in motion ends no lease", _without_table_entry(Authority, "moving", "stop")),
+    ("an expiry is not noticed", _without_table_entry(AuthorityMachine, "held", "lease expired")),
+    ("a stop in motion ends no lease", _without_table_entry(AuthorityMachine, "moving", "stop")),
     ("commands of ended leases are obeyed", _method(Holders, "_known", _ended_leases_count)),
     ("a client learns nothing of news", _without_table_entry(LeaseClient, "held", "doubt")),
     ("a client keeps a lease that ended", _with_action(LeaseClient, _notify)),

@@ -66,7 +66,7 @@ class _Namer:
 
     def _leases(self) -> _Order:
         world = self.world
-        used = world.leases_in_use() | set(world.authority._holders._ended)
+        used = world.leases_in_use() | set(world.authority.holders._ended)
         if world.authority.verifier is not None:
             used.add(world.authority.verifier.lease)
         return _Order(used)
@@ -92,7 +92,7 @@ class _Namer:
             yield prover._newest[0], kind, prover._newest[1]
 
     def _known(self) -> list[Any]:
-        holders = self.world.authority._holders
+        holders = self.world.authority.holders
         return [*([holders.current] if holders.current is not None else []), *holders._ended.values()]
 
     def _provers(self) -> list[tuple[str, Any]]:
@@ -162,18 +162,18 @@ class _Namer:
         return self.leases[command.lease], self.numbers.rank(command.lease, "commands", command.seq)
 
     def _authority(self) -> Any:
-        authority = self.world.authority
+        authority, motion = self.world.authority, self.world.authority.motion
         return (
-            authority._state.value, authority.on_its_own, authority._autonomous,
-            tuple(sorted(authority._moving)), tuple(sorted(authority._moved)),
-            self._ago(authority._stop_at), authority._needs_neutral or "", tuple(map(self._lease, self._known())),
+            authority.machine.state.value, motion.on_its_own, motion.autonomous,
+            tuple(sorted(motion.parts)), tuple(sorted(motion.moved)),
+            self._ago(motion.stop_at), motion.needs_neutral or "", tuple(map(self._lease, self._known())),
             tuple(authority.latches._in_force), tuple(sorted(authority.latches._released)),
-            tuple(sorted(authority.latches._released_fleet)), _stops(tuple(authority._stops)),
+            tuple(sorted(authority.latches._released_fleet)), _stops(tuple(authority.latches._stops)),
         )  # fmt: skip
 
     def _lease(self, holder: Any) -> Any:
         lease = holder.verifier.lease
-        current = self.world.authority._holders.current is holder
+        current = self.world.authority.holders.current is holder
         return (
             self.leases[lease], holder.who, current and self._ago(holder.expires_at),
             current and self.tokens[holder.alive or ""], holder.ended or "",
@@ -203,11 +203,11 @@ class _Namer:
         )  # fmt: skip
         news = world.news[number]
         return (
-            client._state.value,
+            client.state.value,
             signer and (self.leases[signer.lease], self.numbers.rank(signer.lease, "commands", signer._commands),
                         self.numbers.rank(signer.lease, "questions", signer._questions), self._ago(client._expires_at)),
             self._ago(client._due_at) if client.deadline() is not None else 0,
-            self._ago(client._wait_until) if client._state.value in _WAITING else 0,
+            self._ago(client._wait_until) if client.state.value in _WAITING else 0,
             waits, self.tokens[client.request.alive or ""], holder._token is not None,
             news and (self.leases[news.lease] if news.lease else -1, news.holder == client.request.who),
             self.counts[number],

@@ -78,7 +78,7 @@ def _state_holds(world: World, account: Account) -> None:
     holding = [holder.client._signer.lease for holder in world.holders if holder.client._signer is not None]
     if len(holding) != len(set(holding)):
         raise Violation("two programs hold one lease")
-    if (authority.verifier is None) != (authority._holders.current is None):
+    if (authority.verifier is None) != (authority.holders.current is None):
         raise Violation("proofs of no lease are verified")
     lease = authority.verifier.lease if authority.verifier is not None else None
     if lease != account.lease:
@@ -88,7 +88,7 @@ def _state_holds(world: World, account: Account) -> None:
     robot = world.robot
     if robot.in_motion and account.lease is None and not world.overtaken:
         raise Violation("the robot moves, and nobody has the lease")
-    if robot.in_motion and not authority.moving:
+    if robot.in_motion and not authority.motion.moving:
         raise Violation("the robot moves, and the authority does not know")
     deadline = authority.deadline()
     if robot.in_motion and deadline is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -11,7 +12,7 @@ from unittest.mock import patch
 from tests.search.moves import Bounds, moves
 from tests.search.rules import Account, Violation, judge
 from tests.search.world import World
-from zbridge.control.authority import Authority
+from zbridge.control.authority_machine import AuthorityMachine
 from zbridge.lease.lease_client import LeaseClient
 
 STEPS = 12
@@ -60,9 +61,11 @@ def search(bounds: Bounds, *, liveness: bool = True) -> Found:
     found = Found(bounds)
     tables = {
         kind: {state: _Row(kind.__name__, state.value, row, found.cells) for state, row in kind.TABLE.items()}
-        for kind in (Authority, LeaseClient)
+        for kind in (AuthorityMachine, LeaseClient)
     }
-    with patch.object(Authority, "TABLE", tables[Authority]), patch.object(LeaseClient, "TABLE", tables[LeaseClient]):
+    with contextlib.ExitStack() as stack:
+        for kind, table in tables.items():
+            stack.enter_context(patch.object(kind, "TABLE", table))
         _Search(found).run(liveness=liveness)
     return found
 
@@ -174,7 +177,7 @@ def _next(wanted: int | None, world: World) -> World:
     world.channel = 100
     for number, holder in enumerate(world.holders):
         if wanted == number:
-            if holder.client._state.value in ("free", "dropped", "returning"):
+            if holder.client.state.value in ("free", "dropped", "returning"):
                 holder.want()
         elif wanted is not None:
             holder.drop()

@@ -330,7 +330,7 @@ class World:
         if command.what in MOVES:
             if sender.stale:
                 raise Stale("given too long ago")
-            self.authority.check_motion()
+            self.authority.motion.check_motion()
 
     def _tell(self, command: Command, sender: CommandSender) -> None:
         what = command.what
@@ -343,7 +343,7 @@ class World:
             self.authority.applied(part, sender.given_at, moving=moving, stale=sender.stale, whole=whole)
         else:
             self.robot.autonomous = what == "autonomous"
-            self.authority.mode_chosen(autonomous=what == "autonomous")
+            self.authority.motion.mode_chosen(autonomous=what == "autonomous")
 
     def stop(self, latch: str | None = None) -> None:
         """Let somebody stop the robot, or latch it."""
@@ -434,7 +434,7 @@ class World:
 
     def _matters(self, alive: str) -> bool:
         """Tell whether anything can still be ended by the end of a token."""
-        holder = self.authority._holders.current
+        holder = self.authority.holders.current
         return (holder is not None and holder.alive == alive) or any(
             isinstance(each, Query) and alive == each.alive for each in self.net
         )
@@ -498,22 +498,23 @@ def _bare(old: Any) -> Any:
 
 def _authority(old: Authority, world: World) -> Authority:
     new: Authority = _bare(old)
-    new._moving, new._stops, new._events = set(old._moving), old._stops.copy(), []
-    new._moved = set(old._moved)
-    new.latches = latches = _bare(old.latches)
+    new.machine = machine = _bare(old.machine)
+    new.motion = machine.motion = motion = _bare(old.motion)
+    motion.parts, motion.moved, machine.events = set(motion.parts), set(motion.moved), []
+    new.latches = machine._latches = latches = _bare(old.latches)
+    latches._stops, latches._unsaved = latches._stops.copy(), set(latches._unsaved)
     latches._in_force = dict(latches._in_force)
     latches._released, latches._released_fleet = latches._released.copy(), latches._released_fleet.copy()
     new._refusals = _bare(old._refusals)
     new._refusals._counts = type(old._refusals._counts)(
         (key, count) for key, count in old._refusals._counts.items() if key[2] == Code.LEASE_ENDED and key[0]
     )
-    new._holders = holders = _bare(old._holders)
+    new.holders = machine.holders = holders = _bare(old.holders)
     if holders.current is not None:
         holders.current = _lease_copy(holders.current)
-        new.verifier = holders.current.verifier
     used = world.leases_in_use()
-    holders._ended = type(old._holders._ended)(
-        (lease, _lease_copy(holder)) for lease, holder in old._holders._ended.items() if lease in used
+    holders._ended = type(old.holders._ended)(
+        (lease, _lease_copy(holder)) for lease, holder in old.holders._ended.items() if lease in used
     )
     return new
 

@@ -16,12 +16,15 @@ class Mutant(NamedTuple):
 
 
 AUTHORITY = "zbridge/control/authority.py"
+MACHINE = "zbridge/control/authority_machine.py"
+MOTION = "zbridge/control/commanded_motion.py"
 HOLDERS = "zbridge/control/holders.py"
 ENFORCER = "zbridge/control/enforcer.py"
 LATCH = "zbridge/control/latch.py"
 INTENT = "zbridge/hq/intent.py"
 STICK = "zbridge/lease/stick.py"
 OWNERSHIP = "zbridge/robot/ownership.py"
+CLAIM_BUS = "zbridge/robot/claim_bus.py"
 CLAIM = "zbridge/robot/claim.py"
 COMMANDS = "zbridge/robot/commands.py"
 DEVICE = "zbridge/robot/device.py"
@@ -31,28 +34,28 @@ PRESENCE = "zbridge/robot/presence.py"
 
 MUTANTS = (
     # the deadman
-    Mutant("deadman never fires", None, AUTHORITY, "        elif now >= self._stop_at:", "        elif False:"),
-    Mutant("deadman not started", None, AUTHORITY, "self._stop_at = cause.at + self._deadman_s\n\n", "pass\n\n"),
+    Mutant("deadman never fires", None, AUTHORITY, "        elif now >= self.motion.stop_at:", "        elif False:"),
+    Mutant("deadman not started", None, MACHINE, "        self.motion.start(cause.at)\n", "        pass\n"),
     Mutant(
         "repeated motion extends by three deadmen",
         None,
-        AUTHORITY,
-        "            self._stop_at = given_at + self._deadman_s\n            return",
-        "            self._stop_at = given_at + 3 * self._deadman_s\n            return",
+        MOTION,
+        "            self.stop_at = given_at + self.deadman_s\n            return",
+        "            self.stop_at = given_at + 3 * self.deadman_s\n            return",
     ),
     Mutant(
         "deadman as the robot allows",
         None,
-        AUTHORITY,
+        MACHINE,
         "Verifier(lease, token), deadman_s",
         "Verifier(lease, token), self.deadman_s",
     ),
     Mutant(
         "deadman sends no stop",
         None,
-        AUTHORITY,
-        "cause.reason, stops=cause.stops))\n        self._moved |= self._moving",
-        "cause.reason, stops=False))\n        self._moved |= self._moving",
+        MACHINE,
+        "cause.reason, stops=cause.stops))\n        motion.require_neutral",
+        "cause.reason, stops=False))\n        motion.require_neutral",
     ),
     Mutant(
         "timer not armed",
@@ -64,57 +67,57 @@ MUTANTS = (
     Mutant(
         "required neutral forgotten",
         None,
-        AUTHORITY,
-        "        if self._needs_neutral is not None:\n            raise NeutralFirst",
+        MOTION,
+        "        if self.needs_neutral is not None:\n            raise NeutralFirst",
         "        if False:\n            raise NeutralFirst",
     ),
     Mutant(
         "required neutral ends with motion",
         None,
-        AUTHORITY,
-        "        self._still()\n        self._needs_neutral = cause.reason\n",
-        "        self._still()\n        self._needs_neutral = None\n",
+        MOTION,
+        "        self._still()\n        self.needs_neutral = reason\n",
+        "        self._still()\n        self.needs_neutral = None\n",
     ),
     # the lease: expiry, token, proof
     Mutant(
         "lease never expires",
         "bus",
         AUTHORITY,
-        'self._handle(Input.EXPIRED, Cause(reason="lease expired"))',
+        'self.machine.handle(Input.EXPIRED, Cause(reason="lease expired"))',
         "pass",
     ),
     Mutant(
         "expiry leaves the robot moving",
         "bus",
-        AUTHORITY,
+        MACHINE,
         "        Input.EXPIRED: (_end, State.STOPPED),\n",
         "",
     ),
     Mutant(
         "loss of the holder ignored",
         "bus",
-        AUTHORITY,
+        MACHINE,
         "        Input.HOLDER_LOST: (_end, State.STOPPED),\n",
         "",
     ),
     Mutant(
         "loss of the bus ignored",
         "bus",
-        AUTHORITY,
+        MACHINE,
         "        Input.BUS_LOST: (_end, State.STOPPED),\n",
         "",
     ),
     Mutant(
         "stop does not end the lease",
         "mixed",
-        AUTHORITY,
+        MACHINE,
         "        Input.STOP: (_end, State.STOPPED),\n        Input.LATCH: (_end, State.LATCHED),\n        Input.EXP",
         "        Input.LATCH: (_end, State.LATCHED),\n        Input.EXP",
     ),
     Mutant(
         "a held robot is granted to anybody",
         None,
-        AUTHORITY,
+        MACHINE,
         "Input.ACQUIRE: (_deny, None),",
         "Input.ACQUIRE: (_grant, State.HELD),",
     ),
@@ -150,9 +153,9 @@ MUTANTS = (
     Mutant(
         "release does not stop the robot",
         None,
-        AUTHORITY,
-        "stops = cause.kind in (EventKind.STOPPED, EventKind.LATCHED) or self.moving",
-        "stops = kind in (EventKind.STOPPED, EventKind.LATCHED)",
+        MACHINE,
+        "stops = cause.kind in (EventKind.STOPPED, EventKind.LATCHED) or self.motion.moving",
+        "stops = cause.kind in (EventKind.STOPPED, EventKind.LATCHED)",
     ),
     Mutant(
         "a lease is not renewed by commands",
@@ -206,8 +209,8 @@ MUTANTS = (
         "stop never written",
         None,
         ENFORCER,
-        "        if event.stops:\n            self._send_stop()",
-        "        if False:\n            self._send_stop()",
+        "                if event.stops:\n                    self._send_stop()",
+        "                if False:\n                    self._send_stop()",
     ),
     Mutant(
         "autonomous mode survives a stall",
@@ -256,7 +259,7 @@ MUTANTS = (
     Mutant(
         "ownership never yields (split brain)",
         "ownership",
-        OWNERSHIP,
+        CLAIM_BUS,
         "        return any(claim.better_than(own, zid, self._bus.zid) for zid, claim in claims.items())",
         "        return False",
     ),
@@ -270,7 +273,7 @@ MUTANTS = (
     Mutant(
         "a claim is not announced",
         "ownership",
-        OWNERSHIP,
+        CLAIM_BUS,
         "question.answer(write(self._claim()))",
         "question.answer(write(Claim()))",
     ),
@@ -278,7 +281,7 @@ MUTANTS = (
         "nobody looks before taking",
         "ownership",
         OWNERSHIP,
-        "if self._bus_gone or await self._sees(others):",
+        "if self._bus.gone or await self._sees(others):",
         "if False:",
     ),
     Mutant(
@@ -312,11 +315,11 @@ MUTANTS = (
         "                pass\n        return",
     ),
     # latch
-    Mutant("a latch is a plain stop", "latch", AUTHORITY, "        if stop.latch is True:", "        if False:"),
+    Mutant("a latch is a plain stop", "latch", LATCH, "        if stop.latch is not True:", "        if True:"),
     Mutant(
         "a latched robot is granted",
         "latch",
-        AUTHORITY,
+        MACHINE,
         "            Input.ACQUIRE: (_refuse_latched, None),",
         "            Input.ACQUIRE: (_grant, State.HELD),",
     ),
@@ -330,7 +333,7 @@ MUTANTS = (
     Mutant(
         "a takeover ends a latch",
         "latch",
-        AUTHORITY,
+        MACHINE,
         "            Input.TAKEOVER: (_refuse_latched, None),",
         "            Input.TAKEOVER: (_grant, State.HELD),",
     ),
@@ -338,14 +341,14 @@ MUTANTS = (
         "any unlatch frees the robot",
         "latch",
         AUTHORITY,
-        "        if not self.latches:\n            self._handle(Input.UNLATCH, Cause())",
-        "        self._handle(Input.UNLATCH, Cause())",
+        "        if not self.latches:\n            self.machine.handle(Input.UNLATCH, Cause())",
+        "        self.machine.handle(Input.UNLATCH, Cause())",
     ),
     Mutant(
         "latched robots forget at their start",
         "latch",
-        AUTHORITY,
-        "State.LATCHED if self.latches else State.FREE",
+        MACHINE,
+        "State.LATCHED if latches else State.FREE",
         "State.FREE",
     ),
     # motion by itself
@@ -354,7 +357,7 @@ MUTANTS = (
         "situations",
         ENFORCER,
         "        self.authority.latches.autonomous = True\n        return self._save",
-        "        return self._keep",
+        "        return self._save",
     ),
     Mutant(
         "mode 3 does not wait for the disk",

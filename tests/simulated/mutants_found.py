@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from tests.simulated.mutants_data import (
-    AUTHORITY,
     COMMANDS,
     DEVICE,
     ENFORCER,
     HOLDERS,
     INTENT,
     LATCH,
+    MACHINE,
     PRESENCE,
     STANDSTILL,
     Mutant,
@@ -23,7 +23,7 @@ def _mutant(name: str, file: str, old: str, new: str) -> Mutant:
 FOUND = (
     _mutant(
         "ages are counted from the first command",
-        AUTHORITY,
+        MACHINE,
         "        age.late_s(request.t, cause.received_ms)\n",
         "",
     ),
@@ -31,7 +31,7 @@ FOUND = (
         "a suspension ends no lease of a robot that does not move",
         ENFORCER,
         '            self.stop(f"the gateway\'s machine was suspended for {asleep_s:.1f} s")\n',
-        "            if self.authority.moving:\n                self.stop(f'suspended for {asleep_s:.1f} s')\n",
+        "            if self.authority.motion.moving:\n                self.stop(f'suspended for {asleep_s:.1f} s')\n",
     ),
     _mutant(
         "a takeover does not wait for the fleet's latched stops",
@@ -49,7 +49,7 @@ FOUND = (
         "the loss of a robot that does not move holds nobody back",
         PRESENCE,
         "            if not self._leaving:\n",
-        "            if not self._leaving and self._enforcer.authority.moving:\n",
+        "            if not self._leaving and self._enforcer.authority.motion.moving:\n",
     ),
     _mutant(
         "neutral does not call off a mode 3 that waits for the disk",
@@ -214,7 +214,7 @@ FOUND = (
     _mutant(
         "a yielded gateway serves the robot when its bus is cut",
         "zbridge/robot/ownership.py",
-        "        if self._bus_gone:\n            return False\n        self._looks -= 1\n",
+        "        if self._bus.gone:\n            return False\n        self._looks -= 1\n",
         "        self._looks -= 1\n",
     ),
     _mutant(

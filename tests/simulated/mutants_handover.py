@@ -47,8 +47,9 @@ HANDOVER = (
     _mutant(
         "a successor does not know the latched stops",
         "zbridge/control/authority.py",
-        "        self.latches.restore(state)\n        if self.latches:\n            self._state = State.LATCHED\n",
-        "        self._state = State.FREE\n",
+        "        self.latches.restore(state)\n"
+        "        if self.latches:\n            self.machine.state = State.LATCHED\n",
+        "        self.machine.state = State.FREE\n",
     ),
     _mutant(
         "HQ programs are not handed over",

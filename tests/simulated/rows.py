@@ -12,13 +12,13 @@ from collections.abc import Iterator
 from typing import Any
 from unittest.mock import patch
 
-from zbridge.control.authority import Authority
+from zbridge.control.authority_machine import AuthorityMachine
 from zbridge.errors import Code
 from zbridge.hq.intent import Intent
 from zbridge.lease.lease_client import LeaseClient
 from zbridge.robot.ownership import Ownership
 
-MACHINES: tuple[Any, ...] = (Authority, LeaseClient, Intent, Ownership)
+MACHINES: tuple[Any, ...] = (AuthorityMachine, LeaseClient, Intent, Ownership)
 EVENTS = {
     "the client is killed": "client: kill",
     "the client is frozen": "client: pause",

@@ -192,11 +192,9 @@ class Gateway:
                 robot,
                 self.sessions,
                 self.metrics,
-                self._runtime.clock,
+                self._runtime,
                 each,
-                self._runtime.raw_ms,
                 self._runtime.kernel,
-                self._runtime.suspended_s,
             )
             for plan, name, each in zip(plans, names, exported, strict=True)
         ]

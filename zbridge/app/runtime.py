@@ -11,36 +11,28 @@ import contextlib
 import logging
 import random
 import secrets
-import time
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
-
-import msgspec
 
 from zbridge.app.config import GatewayPlan
 from zbridge.app.handover.processes import PROCESSES, Processes
 from zbridge.app.joining import can_connect, join_bus
 from zbridge.bus import Bus
-from zbridge.clocks import raw_ms, suspended_s
+from zbridge.clocks import Clocks
 from zbridge.control.audit_log import Audit, AuditFile
 from zbridge.control.context import Conditions
 from zbridge.metrics import Metrics
 from zbridge.transport.kernel import KERNEL, Kernel
 
 
-class Runtime(msgspec.Struct, frozen=True):
+class Runtime(Clocks, frozen=True):
     """The machine below one gateway.
 
-    clock: seconds on the time line of event loops, without their rounding. clock_ns: Unix time. raw_ms, suspended_s:
-    see :mod:`zbridge.clocks`. chance: 0 to 1. secret: so many random bytes. folder: where latched stops are
-    kept; None: where :func:`zbridge.control.latch_store.state_folder` says. processes: for a restart. join: opens the
-    bus, however long that takes. can_connect: whether a second session connects to it.
+    chance: 0 to 1. secret: so many random bytes. folder: where latched stops are kept; None: where
+    :func:`zbridge.control.latch_store.state_folder` says. processes: for a restart. join: opens the bus, however long
+    that takes. can_connect: whether a second session connects to it.
     """
 
-    clock: Callable[[], float] = time.monotonic
-    clock_ns: Callable[[], int] = time.time_ns
-    raw_ms: Callable[[], float] = raw_ms
-    suspended_s: Callable[[], float] = suspended_s
     chance: Callable[[], float] = random.random
     secret: Callable[[int], bytes] = secrets.token_bytes
     kernel: Kernel = KERNEL

@@ -164,5 +164,5 @@ class Serving:
             self._logged_at = self._clock()
             log.error("%s: %s", self._robot, text)
             for zid in zids[:_LISTED]:
-                self._device.enforcer.refuse("claim", Held("this gateway serves the robot"), zid)
+                self._device.enforcer.authority.refuse("claim", Held("this gateway serves the robot"), zid)
                 self._device.enforcer.settle()

@@ -13,16 +13,16 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures
 import contextlib
+import functools
 import threading
-from collections.abc import Coroutine, Iterable, Iterator, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
 
 import zbridge.client
 from zbridge.bus import Tls
 from zbridge.client import driver, feed
 from zbridge.client import fleet as fleets
-from zbridge.client.stops import Outcome
 from zbridge.errors import BusError, LeaseLost
 from zbridge.fleet.messages import (
     Battery,
@@ -30,7 +30,6 @@ from zbridge.fleet.messages import (
     Devices,
     FleetMessage,
     Image,
-    Latch,
     Map,
     Motion,
     Pose,
@@ -38,13 +37,13 @@ from zbridge.fleet.messages import (
     Reading,
     Scan,
     Scanner,
-    SensorSetting,
-    SessionEntry,
     Status,
     Switch,
     Text,
 )
 
+P = ParamSpec("P")
+S = TypeVar("S")
 T = TypeVar("T")
 F = TypeVar("F", bound=FleetMessage)
 
@@ -96,63 +95,57 @@ def connect(
         yield Fleet(loop, fleet)
 
 
-class Fleet:
-    """All robots of one realm: ``fleet["r1"]``."""
+class _Blocking(Generic[S]):
+    """The like of an object of the client whose methods are awaited."""
 
-    def __init__(self, loop: _Loop, fleet: fleets.Fleet) -> None:
+    def __init__(self, loop: _Loop, source: S) -> None:
         self._loop = loop
-        self._fleet = fleet
+        self._source = source
 
     def __repr__(self) -> str:
-        return repr(self._fleet)
+        return repr(self._source)
+
+
+def _waits(method: Callable[Concatenate[Any, P], Coroutine[Any, Any, T]]) -> Callable[Concatenate[Any, P], T]:
+    """Return a method that runs the source's method of this name on the loop's thread, and waits for it."""
+
+    @functools.wraps(method)
+    def run(self: _Blocking[Any], /, *args: P.args, **kwargs: P.kwargs) -> T:
+        result: T = self._loop.run(getattr(self._source, method.__name__)(*args, **kwargs))
+        return result
+
+    return run
+
+
+class Fleet(_Blocking[fleets.Fleet]):
+    """All robots of one realm: ``fleet["r1"]``."""
 
     def __getitem__(self, name: str) -> Robot:
         """Return the robot of this name, whether or not it is on the bus."""
-        return Robot(self._loop, self._fleet[name])
+        return Robot(self._loop, self._source[name])
 
-    def robots(self) -> dict[str, Status | None]:
-        """Return the robots that have a gateway or a status, by name."""
-        return self._loop.run(self._fleet.robots())
-
-    def sessions(self) -> dict[tuple[str, str], tuple[SessionEntry, ...]]:
-        """Return the session tables by robot and process; see :meth:`zbridge.client.fleet.Fleet.sessions`."""
-        return self._loop.run(self._fleet.sessions())
-
-    def stop(self, names: Iterable[str] | None = None, reason: str | None = None) -> dict[str, Outcome]:
-        """Stop these robots, or all that have a gateway; return for each the error, None if the stop was confirmed."""
-        return self._loop.run(self._fleet.stop(names, reason))
-
-    def latch(self, names: Iterable[str] | None = None, reason: str | None = None) -> dict[str, Outcome]:
-        """Stop them, and prevent driving until they are released."""
-        return self._loop.run(self._fleet.latch(names, reason))
-
-    def unlatch(self) -> dict[str, Outcome]:
-        """Release the latched stops of the whole fleet; return for each robot the error, None if it was released."""
-        return self._loop.run(self._fleet.unlatch())
+    robots = _waits(fleets.Fleet.robots)
+    sessions = _waits(fleets.Fleet.sessions)
+    stop = _waits(fleets.Fleet.stop)
+    latch = _waits(fleets.Fleet.latch)
+    unlatch = _waits(fleets.Fleet.unlatch)
 
 
-class Feed(Generic[T]):
+class Feed(_Blocking[feed.Feed[T]]):
     """The messages of one key, or of several: ``for message in feed``."""
-
-    def __init__(self, loop: _Loop, source: feed.Feed[T]) -> None:
-        self._loop = loop
-        self._feed = source
-
-    def __repr__(self) -> str:
-        return repr(self._feed)
 
     @property
     def lost(self) -> int:
         """Messages that were dropped because the program was slower than the robot."""
-        return self._feed.lost
+        return self._source.lost
 
     @property
     def malformed(self) -> int:
         """Payloads that could not be decoded as their key's message, and were left out."""
-        return self._feed.malformed
+        return self._source.malformed
 
     def __iter__(self) -> Iterator[T]:
-        messages: Any = self._feed.__aiter__()
+        messages: Any = self._source.__aiter__()
 
         async def following() -> T:
             message: T = await anext(messages)
@@ -165,35 +158,30 @@ class Feed(Generic[T]):
 class StateFeed(Feed[F]):
     """The messages of a key that keeps its last value."""
 
-    def __init__(self, loop: _Loop, source: feed.StateFeed[F]) -> None:
-        super().__init__(loop, source)
-        self._state = source
+    _source: feed.StateFeed[F]
 
     def last(self, timeout_s: float = 1.0) -> F | None:
         """Return the last value; None if there is none."""
-        return self._loop.run(self._state.last(timeout_s))
+        return self._loop.run(self._source.last(timeout_s))
 
 
 class ControlFeed(StateFeed[Control]):
     """The messages of ``control``; calling the feed acquires the right to drive."""
 
-    def __init__(self, loop: _Loop, source: fleets.ControlFeed) -> None:
-        super().__init__(loop, source)
-        self._control = source
+    _source: fleets.ControlFeed
 
     @contextlib.contextmanager
     def __call__(self, who: str | None = None, **request: Any) -> Iterator[Driver]:
         """Hold the lease while the context lasts; see :meth:`zbridge.client.fleet.ControlFeed.__call__`."""
-        with _entered(self._loop, self._control(who, **request)) as holder:
+        with _entered(self._loop, self._source(who, **request)) as holder:
             yield Driver(self._loop, holder)
 
 
-class Robot:
+class Robot(_Blocking[fleets.Robot]):
     """One robot: a feed for each key it publishes, queries, commands that need no lease, and the lease."""
 
     def __init__(self, loop: _Loop, robot: fleets.Robot) -> None:
-        self._loop = loop
-        self._robot = robot
+        super().__init__(loop, robot)
         self.name = robot.name
         self.scan: Feed[Scan] = Feed(loop, robot.scan)
         self.motion: Feed[Motion] = Feed(loop, robot.motion)
@@ -209,107 +197,46 @@ class Robot:
         self.devices: StateFeed[Devices] = StateFeed(loop, robot.devices)
         self.control = ControlFeed(loop, robot.control)
 
-    def __repr__(self) -> str:
-        return repr(self._robot)
-
     def sensor(self, name: str) -> Feed[Reading]:
         """Return the feed of one sensor."""
-        return Feed(self._loop, self._robot.sensor(name))
+        return Feed(self._loop, self._source.sensor(name))
 
     @property
     def sensors(self) -> Feed[tuple[str, Reading]]:
         """All sensors: pairs of name and reading."""
-        return Feed(self._loop, self._robot.sensors)
+        return Feed(self._loop, self._source.sensors)
 
     def raw(self, protocol: str) -> Feed[Raw]:
-        """Return the feed of legacy messages that no fleet message represents."""
-        return Feed(self._loop, self._robot.raw(protocol))
+        """Return the feed of the legacy messages that no fleet message can hold."""
+        return Feed(self._loop, self._source.raw(protocol))
 
-    def ask_pose(self) -> Pose:
-        """Ask the robot for its pose now."""
-        return self._loop.run(self._robot.ask_pose())
-
-    def ask_map(self) -> Map:
-        """Ask the robot for its map now."""
-        return self._loop.run(self._robot.ask_map())
-
-    def stop(self, reason: str | None = None) -> None:
-        """Stop the robot and end any lease; return when its gateway has confirmed the stop."""
-        self._loop.run(self._robot.stop(reason))
-
-    def latch(self, reason: str | None = None) -> None:
-        """Stop the robot, and prevent driving until it is released."""
-        self._loop.run(self._robot.latch(reason))
-
-    def unlatch(self) -> tuple[Latch, ...]:
-        """Release the latched stops of this robot; return those that were in force."""
-        return self._loop.run(self._robot.unlatch())
-
-    def set_light(self, on: bool) -> None:
-        """Turn the light on or off."""
-        self._loop.run(self._robot.set_light(on))
-
-    def set_lidar(self, on: bool) -> None:
-        """Turn the lidar on or off."""
-        self._loop.run(self._robot.set_lidar(on))
-
-    def set_camera(self, on: bool) -> None:
-        """Turn the camera on or off."""
-        self._loop.run(self._robot.set_camera(on))
-
-    def say(self, text: str) -> None:
-        """Send the robot a text."""
-        self._loop.run(self._robot.say(text))
-
-    def feed_scan(self, scan: Scan) -> None:
-        """Send the robot simulated lidar data."""
-        self._loop.run(self._robot.feed_scan(scan))
-
-    def set_sensor(self, name: str, setting: SensorSetting) -> None:
-        """Change the settings of a sensor."""
-        self._loop.run(self._robot.set_sensor(name, setting))
+    ask_pose = _waits(fleets.Robot.ask_pose)
+    ask_map = _waits(fleets.Robot.ask_map)
+    stop = _waits(fleets.Robot.stop)
+    latch = _waits(fleets.Robot.latch)
+    unlatch = _waits(fleets.Robot.unlatch)
+    set_light = _waits(fleets.Robot.set_light)
+    set_lidar = _waits(fleets.Robot.set_lidar)
+    set_camera = _waits(fleets.Robot.set_camera)
+    say = _waits(fleets.Robot.say)
+    feed_scan = _waits(fleets.Robot.feed_scan)
+    set_sensor = _waits(fleets.Robot.set_sensor)
 
 
-class Driver:
-    """The lease of one robot: call ``drive(forward=0.3)`` repeatedly: motion lasts only ``deadman_s``."""
-
-    def __init__(self, loop: _Loop, holder: driver.Driver) -> None:
-        self._loop = loop
-        self._driver = holder
-
-    def __repr__(self) -> str:
-        return repr(self._driver)
+class Driver(_Blocking[driver.Driver]):
+    """The lease of one robot: ``drive(forward=0.3)``, again and again, for motion lasts only ``deadman_s``."""
 
     @property
     def loss(self) -> LeaseLost | None:
         """Why the lease was lost, None while it is held."""
-        return self._driver.loss
+        return self._source.loss
 
-    def __call__(
-        self, forward: float = 0.0, left: float = 0.0, turn: float = 0.0, *, light: bool | None = None
-    ) -> None:
-        """Drive: fractions of full scale, -1 to 1; all zero is neutral."""
-        self._loop.run(self._driver(forward, left, turn, light=light))
-
-    def during(self, seconds: float, forward: float = 0.0, left: float = 0.0, turn: float = 0.0) -> None:
-        """Drive for ``seconds``, then send neutral."""
-        self._loop.run(self._driver.during(seconds, forward, left, turn))
-
-    def neutral(self) -> None:
-        """Send neutral, which ends a NeutralFirst; see :meth:`zbridge.client.driver.Driver.neutral`."""
-        self._loop.run(self._driver.neutral())
-
-    def motor(self, name: str, value: float) -> None:
-        """Move one motor: rad/s, or metres for a linear motor."""
-        self._loop.run(self._driver.motor(name, value))
-
-    def mode(self, mode: str) -> None:
-        """Set who moves the robot: ``none``, ``manual`` or ``autonomous``."""
-        self._loop.run(self._driver.mode(mode))
-
-    def raw(self, protocol: str, message_id: int, body: bytes = b"") -> None:
-        """Send a legacy message that no fleet message represents."""
-        self._loop.run(self._driver.raw(protocol, message_id, body))
+    __call__ = _waits(driver.Driver.__call__)
+    during = _waits(driver.Driver.during)
+    neutral = _waits(driver.Driver.neutral)
+    motor = _waits(driver.Driver.motor)
+    mode = _waits(driver.Driver.mode)
+    raw = _waits(driver.Driver.raw)
 
 
 @contextlib.contextmanager

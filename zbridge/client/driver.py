@@ -9,7 +9,7 @@ import socket
 from collections.abc import Callable, Coroutine
 from typing import Any
 
-from zbridge.bus import Bus, Publisher, Sample
+from zbridge.bus import Bus, Sample
 from zbridge.bus.tls.membership import Right, lacking
 from zbridge.clocks import raw_ms
 from zbridge.errors import BusError, BusRefused, Held, LeaseLost, NeutralFirst, PayloadError, Refused
@@ -18,11 +18,10 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Acquire, Control, Drive, FleetMessage, Mode, Motor, Raw, Refusal
 from zbridge.fleet.topics import KeySpace, Topic
-from zbridge.lease.lease_client import RETRY_S, LeaseClient
+from zbridge.lease.commands import CommandPublishers
+from zbridge.lease.lease_client import LeaseClient
 from zbridge.lease.lease_events import NAMED, LeaseEvent, LeaseEventKind
 from zbridge.lease.lease_holder import LeaseHolder
-
-__all__ = ["RETRY_S", "Driver", "default_who"]
 
 REPEAT_S = 0.05
 """Seconds between the commands of :meth:`Driver.during`."""
@@ -79,7 +78,7 @@ class Driver:
         self._tasks: set[asyncio.Task[None]] = set()
         self._lock = asyncio.Lock()
         self._refusal: Refused | None = None
-        self._publishers: dict[str, Publisher] = {}
+        self._commands = CommandPublishers(bus, keys)
 
     def __repr__(self) -> str:
         return f"<Driver of {self.robot} {'lost' if self.loss else 'holding'}>"
@@ -143,7 +142,7 @@ class Driver:
         """
         if self._lock.locked():
             return False
-        refusal = self._put(topics.CMD_DRIVE, drive, self._clock_ms())
+        refusal, _ = self._put(topics.CMD_DRIVE, drive, self._clock_ms())
         if refusal is not None:
             raise refusal
         return True
@@ -151,16 +150,16 @@ class Driver:
     async def _send(self, topic: Topic, message: FleetMessage) -> None:
         given_ms = self._clock_ms()
         async with self._lock:
-            refusal = self._put(topic, message, given_ms)
-            if topic is not topics.CMD_DRIVE:  # a thread writes it: the next command must not overtake it
+            refusal, unwritten = self._put(topic, message, given_ms)
+            if unwritten:
                 await self._bus.flush()
             if refusal is not None:
                 raise refusal
 
-    def _put(self, topic: Topic, message: FleetMessage, given_ms: float) -> Refused | None:
+    def _put(self, topic: Topic, message: FleetMessage, given_ms: float) -> tuple[Refused | None, bool]:
         """Put a command; return the refusal of an earlier one that is to be raised now that neutral was sent.
 
-        given_ms: the raw clock when the program gave it.
+        given_ms: the raw clock when the program gave it. Also returns whether the bus must be flushed.
         """
         if self.loss is not None:
             loss = LeaseLost(str(self.loss), self.loss.code, holder=self.loss.holder)
@@ -169,12 +168,8 @@ class Driver:
         refusal, self._refusal = self._refusal, None
         if refusal is not None and getattr(message, "moving", True):
             raise refusal
-        publisher = self._publishers.get(topic.path)
-        if publisher is None:
-            publisher = self._publishers[topic.path] = self._bus.publisher(self._keys.key(topic.path), topic)
-        payload = payloads.encode(message)
-        publisher.put(payload, self._client.prove(publisher.key, payload, given_ms))
-        return refusal
+        unwritten = self._commands.put(topic, message, self._client, given_ms)
+        return refusal, unwritten
 
     # The lease
 
@@ -222,8 +217,7 @@ class Driver:
         self._holder.close()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         self._holder.withdraw()
-        for publisher in self._publishers.values():
-            publisher.close()
+        self._commands.close()
 
     def _spawn(self, work: Coroutine[Any, Any, None]) -> None:
         task = asyncio.get_running_loop().create_task(work)

@@ -116,8 +116,8 @@ class QueryFilter:
 
     def __call__(self, key: str, shown: bytes | None, size: int, read_payload: ReadPayload) -> PriorityClass | None:
         """Return COMMAND if the proof shows the holder as the sender and the number is new."""
-        verifier = self._authority.verifier
-        if shown is None or verifier is None or not verifier.plausible(shown):
+        holder = self._authority.holders.current
+        if shown is None or holder is None or not (verifier := holder.verifier).plausible(shown):
             return self.refusals.priority(Code.NO_LEASE)
         try:
             authorization = read(shown)
@@ -175,9 +175,9 @@ class CommandFilter:
     def _stop(self, payload: bytes) -> PriorityClass | None:
         """Let a stop through unless it changes nothing. The holder is checked last: a new one may come meanwhile."""
         stop_id = read_stop(payload).id
-        known = stop_id is UNSET or stop_id in self._authority.stop_ids
+        known = stop_id is UNSET or stop_id in self._authority.latches.stop_ids
         fresh = self._clock() - self._stopped_at < SAME_STOP_S
-        if known and fresh and not self._authority.moving and self._authority.verifier is None:
+        if known and fresh and not self._authority.motion.moving and self._authority.verifier is None:
             self.same_stops += 1
             return None
         return PriorityClass.STOP if stop_id is UNSET else PriorityClass.LATCH

@@ -80,7 +80,7 @@ class RobotContext(msgspec.Struct, frozen=True):
 
     publish: shows a message on the bus. pump: writes to the robot what its sessions have to write.
     clock: seconds on the event loop's time line, from any thread. clock_ns: Unix time in nanoseconds, for stamps.
-    raw_ms, suspended_s: see the functions.
+    raw_ms, suspended_s: see :mod:`zbridge.clocks`.
     """
 
     robot: RobotSide

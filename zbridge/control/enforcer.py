@@ -21,7 +21,7 @@ from zbridge.control.admission import CommandFilter, RefusalLimit
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
 from zbridge.control.context import RobotContext
-from zbridge.control.events import AuthorityEvent, CommandSender, EventKind
+from zbridge.control.events import CommandSender, EventKind
 from zbridge.control.latch import Latches, LatchRecord, read_stop
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import Standstill
@@ -71,7 +71,8 @@ class Enforcer:
         """Called after :meth:`settle`: whether the robot is driven, or (``at_once``) how it is stopped, may be new."""
         self._stops_anew = False
         """Whether a command has just changed how the robot is stopped."""
-        self._refusal_limits: dict[str, RefusalLimit] = {"commands": self.admission.refusals}
+        self.refusal_limits: dict[str, RefusalLimit] = {"commands": self.admission.refusals}
+        """What admission filters drop, by command: :meth:`beat` shows it."""
         self._fleet_stop = KeySpace(context.keys.realm, "*").key(topics.CMD_STOP.path)
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
@@ -92,7 +93,7 @@ class Enforcer:
     def admit(self, sample: Sample, now: float) -> CommandSender:
         """Return who of the holders sent a command, and renew the lease; raise Refused for other senders."""
         sender = self.authority.admit(sample.attachment, sample.key, sample.payload, now, self._context.raw_ms())
-        if self.authority.eventful:
+        if self.authority.machine.events:  # what was due by then
             self.settle()
         return sender
 
@@ -102,13 +103,9 @@ class Enforcer:
             self._stale.value += 1
             raise Stale("the command is too old: the network delayed it")
 
-    def check_motion(self) -> None:
-        """Raise Refused if the holder must send neutral before the robot moves."""
-        self.authority.check_motion()
-
     def permit(self, command: Drive | Motor, now: float) -> Drive | Motor:
-        """Return the motion that the robot may be sent, within the limits; raise Refused if it may not move."""
-        self.authority.check_motion()
+        """Return the motion that the robot may be sent, within the limits; raise Refused where it may not move."""
+        self.authority.motion.check_motion()
         if self._limits is None or not isinstance(command, Drive):
             return command
         limited = self._limits.limit(command, now)
@@ -122,26 +119,22 @@ class Enforcer:
         """
         authority = self.authority
         if moving:
-            authority.check_motion()
+            authority.motion.check_motion()
         whole = isinstance(command, Drive)
         authority.applied(path, sender.given_at, moving=moving, stale=sender.stale, whole=whole)
         if isinstance(command, Drive):
             if self._limits is not None:
                 self._limits.sent(command, now)
-            if not moving and not authority.driven:
+            if not moving and not authority.motion.driven:
                 self._standstill.neutral(now)
 
     def commanded(self, command: FleetMessage) -> None:
         """Record that the robot was sent something that may move it: a mode, or a raw message."""
         self._stops_anew = isinstance(command, Mode | Raw)
         if isinstance(command, Mode):
-            self.authority.mode_chosen(autonomous=command.mode == "autonomous")
+            self.authority.motion.mode_chosen(autonomous=command.mode == "autonomous")
         elif isinstance(command, Raw):
-            self.authority.sent_opaque()
-
-    def refuse(self, command: str, refusal: Refused, who: str | None) -> None:
-        """Count a refusal, for ``control``; :meth:`settle` shows it."""
-        self.authority.refuse(command, refusal, who)
+            self.authority.motion.sent_opaque()
 
     # Stops
 
@@ -158,7 +151,7 @@ class Enforcer:
 
     def adopt(self, answers: Iterable[FleetLatches]) -> None:
         """Take over the fleet's latched stops that other gateways know."""
-        self.authority.adopt(answers)
+        self.authority.latch(*self.authority.latches.adopt(answers))
         self.settle()
 
     def merge(self, record: LatchRecord) -> None:
@@ -169,7 +162,7 @@ class Enforcer:
         if self.authority.latches.autonomous and not known:
             self._remind()
             self._save_latches()
-            if not self.authority.driven:
+            if not self.authority.motion.driven:
                 self._send_stop()
 
     def restore(self, latches: Latches) -> None:
@@ -187,20 +180,17 @@ class Enforcer:
         self.authority.require_neutral(reason, stops=stops)
         self.settle()
 
-    def bus_lost(self) -> None:
-        """End the lease: its holder cannot reach the gateway any more."""
-        self.authority.bus_lost()
-        self.settle()
-
     # What follows from a decision, and from time going by
 
     def settle(self) -> None:
         """Carry out what the authority decided, and arm the timer for its next deadline."""
-        if self.authority.eventful:
+        if self.authority.machine.events:
             self._settle_events()
         deadline = self.authority.deadline()
         if deadline is not None and deadline < self._timer_at:
-            self._arm(deadline)
+            if self._timer is not None:
+                self._timer.cancel()
+            self._timer_at, self._timer = deadline, self._loop.call_at(deadline, self._on_time)
         stops_anew, self._stops_anew = self._stops_anew, False
         if self.settled is not None:
             self.settled(at_once=stops_anew)
@@ -214,13 +204,14 @@ class Enforcer:
         if self._clock() >= self._timer_at:
             self._on_time()
 
-    def watch_refusals(self, command: str, limit: RefusalLimit) -> None:
-        """Show with every :meth:`beat` what an admission filter dropped."""
-        self._refusal_limits[command] = limit
-
     def beat(self) -> None:
-        """Publish ``control``, and write down what was folded. To be called once a second."""
-        self._count_dropped()
+        """Publish ``control`` with what admission filters dropped, and write down what was folded, once a second."""
+        for command, limit in self.refusal_limits.items():
+            for refusal, count in limit.dropped():
+                self.authority.refuse(command, refusal, count=count)
+                self._refused.value += count - 1  # settling counts one
+        self._same_stops.value = self.admission.same_stops
+        self.settle()
         self._save_latches()
         self.report()
         self._audit.flush()
@@ -243,25 +234,22 @@ class Enforcer:
         changed = False
         while events := self.authority.events():
             for event in events:
-                changed = changed or event.what is not EventKind.REFUSED
-                self._carry_out(event)
+                if event.what is EventKind.REFUSED:
+                    self._refused.value += 1
+                else:
+                    changed = True
+                    if event.what is not EventKind.ACQUIRED and self._limits is not None:
+                        self._limits.stopped()
+                    self._context.metrics.count("control", what=event.what.value).value += 1
+                if event.stops:
+                    self._send_stop()
+                if event.what in (EventKind.LATCHED, EventKind.UNLATCHED):
+                    self._save_latches()
+                self._audit.write(event)
             if self._control_due is None and not self._closed:
                 self._control_due = self._loop.call_later(_CONTROL_S, self.report)
         if changed:
             self.report()
-
-    def _carry_out(self, event: AuthorityEvent) -> None:
-        if event.what is EventKind.REFUSED:
-            self._refused.value += 1
-        else:
-            if event.what is not EventKind.ACQUIRED and self._limits is not None:
-                self._limits.stopped()
-            self._context.metrics.count("control", what=event.what.value).value += 1
-        if event.stops:
-            self._send_stop()
-        if event.what in (EventKind.LATCHED, EventKind.UNLATCHED):
-            self._save_latches()
-        self._audit.write(event)
 
     def _save_latches(self) -> None:
         """Write the latched stops down; ``control`` confirms a new one when that has ended."""
@@ -270,12 +258,12 @@ class Enforcer:
             self._saving += 1
             writing.add_done_callback(self._on_saved)
         elif not self._saving:
-            self.authority.latches_saved()
+            self.authority.latches.saved()
 
     def _on_saved(self, _: object) -> None:
         self._saving -= 1
         if not self._saving:
-            self.authority.latches_saved()
+            self.authority.latches.saved()
             self.report()
 
     def _remind(self) -> None:
@@ -294,21 +282,6 @@ class Enforcer:
             self._standstill.stop()
         except Refused as refusal:
             self.authority.refuse("stop", refusal)
-
-    def _count_dropped(self) -> None:
-        """Show what the admission filters dropped since the last time: an entry for each code, with its count."""
-        for command, limit in self._refusal_limits.items():
-            for refusal, count in limit.dropped():
-                self.authority.refuse(command, refusal, count=count)
-                self._refused.value += count - 1  # settling counts one
-        self._same_stops.value = self.admission.same_stops
-        self.settle()
-
-    def _arm(self, deadline: float) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-        self._timer_at = deadline
-        self._timer = self._loop.call_at(deadline, self._on_time)
 
     def _on_time(self) -> None:
         if self._timer is not None:

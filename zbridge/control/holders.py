@@ -87,6 +87,10 @@ class Holder(msgspec.Struct):
     """The highest number used, of commands and of questions."""
     ended: str | None = None
 
+    def left_s(self, now: float) -> float:
+        """Return the seconds until the lease expires."""
+        return max(0.0, self.expires_at - now)
+
     def late_s(self, shown: Authorization, received_ms: float) -> float:
         """Return by how many seconds a command or question is late; raise Malformed if it should be dated."""
         try:

@@ -59,13 +59,6 @@ def read_stop(payload: bytes) -> Stop:
     return stop if stop.id is not msgspec.UNSET else _PLAIN
 
 
-def latch_of(stop: Stop, *, fleet: bool) -> Latch:
-    """Return the latch of a stop that has one."""
-    assert isinstance(stop.id, bytes)
-    who, reason = (text if isinstance(text, str) else None for text in (stop.who, stop.reason))
-    return Latch(stop.id, who and who[:WHO], reason and reason[:REASON], fleet)
-
-
 class Latches:
     """The latched stops of one robot. record: of the process before."""
 
@@ -76,6 +69,10 @@ class Latches:
         self._released_fleet = deque(record.released_fleet, maxlen=RELEASED)
         self.autonomous = record.autonomous
         """Whether the robot was ever ordered to move by itself, by this gateway or one before."""
+        self._stops: deque[bytes] = deque(maxlen=STOPS)
+        """The ids of the last stops that had one."""
+        self._unsaved: set[bytes] = set()
+        """The ids of latched stops that are not yet stored where they survive this process."""
 
     def __bool__(self) -> bool:
         return bool(self._in_force)
@@ -108,6 +105,35 @@ class Latches:
         """For people: the latest latch, and how many others are in force."""
         *others, last = self.in_force
         return last.described + (f" and {len(others)} more" if others else "")
+
+    @property
+    def stop_ids(self) -> frozenset[bytes]:
+        """The ids of the last stops: what repeats one of them changes nothing. Read by other threads."""
+        return frozenset(self._stops)
+
+    @property
+    def confirmed(self) -> tuple[StopId, ...]:
+        """The ids of the last stops but for latched ones that :meth:`saved` does not cover: ``control`` shows them."""
+        return tuple(stop_id for stop_id in self._stops if stop_id not in self._unsaved)
+
+    def take(self, stop: Stop, *, fleet: bool) -> Latch | None:
+        """Record a stop; return its latch if that is in force now. fleet: all robots of the realm were sent it."""
+        if not isinstance(stop.id, bytes):
+            return None
+        self._stops.append(stop.id)
+        if stop.latch is not True:
+            return None
+        who, reason = (text if isinstance(text, str) else None for text in (stop.who, stop.reason))
+        latch = Latch(stop.id, who and who[:WHO], reason and reason[:REASON], fleet)
+        self.add(latch)
+        if latch.id not in self:
+            return None
+        self._unsaved.add(latch.id)
+        return latch
+
+    def saved(self) -> None:
+        """Record that all latched stops survive this process, or cannot."""
+        self._unsaved.clear()
 
     def add(self, latch: Latch) -> bool:
         """Let a latch come into force; return whether anything changed. A released one stays released."""

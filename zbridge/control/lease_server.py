@@ -28,7 +28,7 @@ TAKEOVERS_HZ = 5.0
 _LISTENER = "hq."
 _COUNTED = 1_000_000
 """Most refusals of one kind that a report counts."""
-_BY_NAME = ("acquire", "takeover", "unlatch", "unlatch_fleet", "refused")
+_BY_NAME = "/*"
 """Queries whose key ends with the name of who asks. On a secure bus nobody can ask at another's key."""
 _ANYBODY = "*"
 
@@ -44,17 +44,18 @@ class LeaseServer:
         self._enforcer = enforcer
         self._authority = authority
         self._clock = clock
-        self._filters: dict[str, QueryFilter | NameFilter] = {
-            "acquire": NameFilter(clock),
-            "takeover": NameFilter(clock),
-            "renew": QueryFilter(authority, clock),
-            "release": QueryFilter(authority, clock),
-            "unlatch": NameFilter(clock),
-            "unlatch_fleet": NameFilter(clock),
-            "refused": NameFilter(clock),
+        self._queries: dict[str, tuple[Decide, QueryFilter | NameFilter]] = {
+            "acquire/*": (self._acquire, NameFilter(clock)),
+            "takeover/*": (self._take_over, NameFilter(clock)),
+            "renew": (self._renew, QueryFilter(authority, clock)),
+            "release": (self._release, QueryFilter(authority, clock)),
+            "unlatch/*": (partial(self._unlatch, fleet=False), NameFilter(clock)),
+            "unlatch_fleet/*": (partial(self._unlatch, fleet=True), NameFilter(clock)),
+            "refused/*": (self._take_reported, NameFilter(clock)),
         }
-        for command, admission in self._filters.items():
-            enforcer.watch_refusals(command, admission.refusals)
+        """Queries about the lease. A key that ends with ``*`` has the name of who asks there."""
+        for name, (_, admission) in self._queries.items():
+            enforcer.refusal_limits[name.removesuffix(_BY_NAME)] = admission.refusals
         self._closing: str | None = None
         self._waits: str | None = None
         """Why no lease is granted yet."""
@@ -67,13 +68,7 @@ class LeaseServer:
     def serve(self) -> list[Handle]:
         """Answer queries about the lease, and watch whether its holder lives."""
         return [
-            self._answer("acquire/*", self._acquire),
-            self._answer("takeover/*", self._take_over),
-            self._answer("renew", self._renew),
-            self._answer("release", self._release),
-            self._answer("unlatch/*", partial(self._unlatch, fleet=False)),
-            self._answer("unlatch_fleet/*", partial(self._unlatch, fleet=True)),
-            self._answer("refused/*", self._take_reported),
+            *(self._answer(name, *query) for name, query in self._queries.items()),
             self._context.bus.answer(self._context.keys.key(topics.RPC_LATCH.path), self._report_latches),
             self._context.bus.watch_alive(self._context.keys.alive(_ANYBODY), self._on_alive),
         ]
@@ -86,9 +81,9 @@ class LeaseServer:
         """Grant no lease until the fleet's latched stops are known; None: they are."""
         self._waits = reason
 
-    def _answer(self, name: str, decide: Decide) -> Handle:
+    def _answer(self, name: str, decide: Decide, admission: QueryFilter | NameFilter) -> Handle:
         """Answer one kind of query, or refuse it and show the refusal on ``control``."""
-        command = name.removesuffix("/*")
+        command = name.removesuffix(_BY_NAME)
 
         def answer(query: IncomingQuery) -> None:
             self._enforcer.keep_time()
@@ -101,12 +96,12 @@ class LeaseServer:
                 query.answer(payloads.encode(decide(query)))
             except (PayloadError, Refused) as error:
                 refusal = error if isinstance(error, Refused) else Malformed(str(error))
-                self._authority.refuse(command, refusal, _bound_name(query, command))
+                self._authority.refuse(command, refusal, _bound_name(query) if command != name else None)
                 query.refuse(refusal)
             self._enforcer.settle()
 
         key = self._context.keys.key(f"@rpc/control/{name}")
-        return self._context.bus.answer(key, answer, priority=self._filters[command])
+        return self._context.bus.answer(key, answer, priority=admission)
 
     def _on_alive(self, key: str, alive: bool) -> None:
         if not alive:
@@ -162,11 +157,9 @@ class LeaseServer:
         return Query()
 
 
-def _bound_name(query: IncomingQuery, command: str) -> str | None:
-    """Return the name in the key of a query, which its payload cannot change; None if the key has none."""
-    if command not in _BY_NAME or not topics.is_concrete(query.asked):
-        return None
-    return topics.unescape(query.asked.rpartition("/")[2])
+def _bound_name(query: IncomingQuery) -> str | None:
+    """Return the name in the key of a query, which its payload cannot change; None where the key has wildcards."""
+    return topics.unescape(query.asked.rpartition("/")[2]) if topics.is_concrete(query.asked) else None
 
 
 def _request(query: IncomingQuery) -> Acquire:

@@ -30,10 +30,7 @@ class Standstill:
     """
 
     def __init__(self, context: RobotContext, authority: Authority, idle_stop_s: float = IDLE_STOP_S) -> None:
-        self._robot = context.robot
-        self._conditions = context.conditions
-        self._faults = context.faults
-        self._pump = context.pump
+        self._context = context
         self._clock = context.clock
         self._authority = authority
         self._idle_stop_s = idle_stop_s
@@ -72,36 +69,36 @@ class Standstill:
         """Return the seconds between two stops while nobody drives."""
         wanted_s = self._idle_stop_s or IDLE_STOP_S
         try:
-            return max(LEAST_IDLE_STOP_S, min(wanted_s, self._robot.idle_stop_s))
+            return max(LEAST_IDLE_STOP_S, min(wanted_s, self._context.robot.idle_stop_s))
         except Exception as error:
-            self._faults.note("idle_stop_s", error)
+            self._context.faults.note("idle_stop_s", error)
             return wanted_s
 
     def _send(self, now: float, until: float) -> None:
         try:
             self._write(now, until)
         except Refused as refusal:
-            self._conditions.set(_CONDITION, f"cannot be stopped: {refusal}")
+            self._context.conditions.set(_CONDITION, f"cannot be stopped: {refusal}")
             raise
-        self._conditions.set(_CONDITION, None)
-        self._pump()
+        self._context.conditions.set(_CONDITION, None)
+        self._context.pump()
 
     def _write(self, now: float, until: float) -> None:
         try:
-            self._robot.stop(now, until)
+            self._context.robot.stop(now, until)
         except Refused:
             raise
         except Exception as error:
-            raise self._faults.refusal("stop", error) from error
+            raise self._context.faults.refusal("stop", error) from error
 
     def _on_time(self) -> None:
         self.begin()
-        session, now = self._robot.driving, self._clock()
+        session, now = self._context.robot.driving, self._clock()
         if session is None or session.state is not State.ESTABLISHED:
-            self._conditions.set(_CONDITION, None)
+            self._context.conditions.set(_CONDITION, None)
         elif (
             (self._idle_stop_s or self._authority.latches)
-            and not self._authority.driven
+            and not self._authority.motion.driven
             and now >= self._repeated_until
         ):
             try:

@@ -8,10 +8,9 @@ from collections.abc import Callable
 import msgspec
 
 from zbridge.errors import BusError, Code, NotReady
-from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Mode, Motor
 from zbridge.fleet.topics import Topic
-from zbridge.hq.bridge import Bridge
+from zbridge.hq.context import Bridge
 from zbridge.lease.lease_client import LeaseClient
 
 log = logging.getLogger("zbridge.hq")
@@ -31,9 +30,8 @@ class _Waiting(msgspec.Struct, frozen=True):
 class CommandQueue:
     """Puts commands on the bus, dated. Each is numbered when it is put, so none may overtake another.
 
-    A drive is put at once. All other commands are written by a thread of the bus: the next command waits until the
-    bus has them. What waits longer than its sender means it is dropped. late: called when the queue resumes; returns
-    whether motion must not be sent any more.
+    See :class:`~zbridge.lease.commands.CommandPublishers`. What waits longer than its sender means it is dropped. late:
+    called when the queue resumes; returns whether motion must not be sent any more.
     """
 
     def __init__(self, bridge: Bridge, lease: LeaseClient, *, who: str, late: Callable[[], bool]) -> None:
@@ -66,8 +64,7 @@ class CommandQueue:
         topic, message = command.topic, command.message
         if isinstance(message, Drive):
             message = self._lit(message)
-        self._bridge.put(topic, message, self._lease, command.given_ms)
-        if topic is not topics.CMD_DRIVE:
+        if self._bridge.put(topic, message, self._lease, command.given_ms):
             self._writing = True
             self._bridge.spawn(self._written())
 

@@ -2,19 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
+from typing import Any
 
 import msgspec
 
-from zbridge.hq.bridge import Bridge
+from zbridge.bus import Bus
+from zbridge.fleet.topics import KeySpace
+from zbridge.fleet.view import RobotView
 from zbridge.hq.freeze import FreezeWatch
 from zbridge.hq.listener_log import ConnectionLog, FailureLog
 from zbridge.hq.robot_subscription import RobotSubscription
 from zbridge.hq.settings import HqSettings
+from zbridge.lease.commands import CommandPublishers
 from zbridge.metrics import Count, Metrics
 from zbridge.protocol.plugin import HqSide
 from zbridge.protocol.session import Limits
 from zbridge.tasks import Tasks
+
+
+class Bridge(CommandPublishers):
+    """What the operators of one listener share: the robot's keys, its view, and publishers for its commands.
+
+    spawn: starts a task.
+    """
+
+    def __init__(
+        self, bus: Bus, keys: KeySpace, view: RobotView, spawn: Callable[[Coroutine[Any, Any, None]], object]
+    ) -> None:
+        super().__init__(bus, keys)
+        self.view = view
+        self.spawn = spawn
 
 
 class ListenerCounts(msgspec.Struct, frozen=True):

@@ -13,12 +13,11 @@ import logging
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from zbridge.clocks import raw_ms, suspended_s
+from zbridge.clocks import Clocks
 from zbridge.hq.admission import FULL, Admission
-from zbridge.hq.bridge import Bridge
 from zbridge.hq.broadcast import Broadcast
 from zbridge.hq.client import SWEEP_S, Client
-from zbridge.hq.context import ListenerContext, listener_counts
+from zbridge.hq.context import Bridge, ListenerContext, listener_counts
 from zbridge.hq.freeze import FROZEN, FreezeWatch
 from zbridge.hq.handover import ListenerHandover
 from zbridge.hq.listener_log import ConnectionLog, FailureLog
@@ -45,9 +44,8 @@ _FRAME_BYTES = 64 * 1024
 class Listener:
     """Serves the clients of one ``[[hq]]`` until cancelled.
 
-    name: of the listener on the bus. clock: seconds on the event loop's time line, by default the loop's own.
-    exported: the listener as another process exported it, and its sockets. clock_ms: the raw clock, which dates
-    commands. kernel: of this machine, or a simulated one. suspended_s: for how long the machine was suspended so far.
+    name: of the listener on the bus. exported: the listener as another process exported it, and its sockets. clocks,
+    kernel: of this machine, or of a simulated one.
     """
 
     def __init__(
@@ -57,22 +55,18 @@ class Listener:
         robot: RobotSubscription,
         sessions: SessionTable,
         metrics: Metrics,
-        clock: Callable[[], float] | None = None,
+        clocks: Clocks = Clocks(),  # noqa: B008 -- frozen
         exported: tuple[Exported, Parcel] | None = None,
-        clock_ms: Callable[[], float] = raw_ms,
         kernel: Kernel = KERNEL,
-        suspended_s: Callable[[], float] = suspended_s,
     ) -> None:
         self._exported = exported
-        self._suspended_s = suspended_s
-        self._clock_ms = clock_ms
+        self._clocks, self._clock = clocks, clocks.clock
         self.name = name
         self.address = plan.address
         self.ready = asyncio.Event()
         """Set when clients are accepted; ``address`` has the port then."""
         self.clients: dict[int, Client] = {}
         self._sessions = sessions
-        self._clock = clock or asyncio.get_running_loop().time
         self._context = context = self._make_context(plan, robot, metrics)
         self._numbers = context.side.numbers(plan.settings.clients)
         self._admission = Admission(plan)
@@ -139,9 +133,9 @@ class Listener:
             counts=counts,
             connections=ConnectionLog(self.name),
             failures=FailureLog(self.name, counts.left_out),
-            freeze=FreezeWatch(self._clock(), self._on_freeze, self._suspended_s),
+            freeze=FreezeWatch(self._clock(), self._on_freeze, self._clocks.suspended_s),
             clock=self._clock,
-            clock_ms=self._clock_ms,
+            clock_ms=self._clocks.raw_ms,
             limits=Limits(
                 frame_bytes=_FRAME_BYTES, handshake_s=plan.settings.handshake_s, rate_hz=plan.settings.rate_hz
             ),

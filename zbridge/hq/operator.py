@@ -17,8 +17,8 @@ from zbridge.errors import Code, NotReady, RateLimited, Unsupported
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Acquire, Control, Drive, FleetMessage, Mode, Motor, Raw, Refusal
 from zbridge.fleet.topics import Topic
-from zbridge.hq.bridge import Bridge
 from zbridge.hq.command_queue import CommandQueue
+from zbridge.hq.context import Bridge
 from zbridge.hq.intent import Intent
 from zbridge.lease.lease_client import LeaseClient
 from zbridge.lease.lease_events import LeaseEvent, LeaseEventKind

@@ -81,6 +81,10 @@ class _Cause(msgspec.Struct, frozen=True):
 Row: TypeAlias = dict[LeaseInput, tuple[Callable[["LeaseClient", _Cause], None], LeaseState]]
 
 
+def _wait(client: LeaseClient, cause: _Cause) -> None:
+    """Do nothing before the answer comes."""
+
+
 class LeaseClient:
     """The lease of one robot for one program.
 
@@ -109,7 +113,7 @@ class LeaseClient:
         self.clock_ms = clock_ms
         self._acquire_key = keys.key((topics.RPC_TAKEOVER if takeover else topics.RPC_ACQUIRE)(name).path)
         self._wait_s = wait_s
-        self._state = LeaseState.FREE
+        self.state = LeaseState.FREE
         self._signer: Signer | None = None
         self._lease_s = LEASE_S
         self._expires_at = self._due_at = math.inf
@@ -121,17 +125,12 @@ class LeaseClient:
         self._events: list[LeaseEvent] = []
 
     def __repr__(self) -> str:
-        return f"<LeaseClient of {self.keys.robot} {self._state}>"
+        return f"<LeaseClient of {self.keys.robot} {self.state}>"
 
     @property
     def held(self) -> bool:
         """Whether commands can be proven."""
         return self._signer is not None
-
-    @property
-    def free(self) -> bool:
-        """Whether there is no lease, and no question on its way."""
-        return self._state is LeaseState.FREE
 
     def prove(self, key: str, payload: bytes, given_ms: float | None = None) -> bytes:
         """Return the attachment of the next command on this key; only while :attr:`held`.
@@ -190,7 +189,7 @@ class LeaseClient:
 
     def deadline(self) -> float | None:
         """Return when :meth:`expire` is next due; None: never."""
-        due = self._state is LeaseState.PAUSED or (self._state is LeaseState.HELD and self.renews)
+        due = self.state is LeaseState.PAUSED or (self.state is LeaseState.HELD and self.renews)
         return self._due_at if due else None
 
     def expire(self, now: float) -> None:
@@ -245,16 +244,14 @@ class LeaseClient:
     # The machine
 
     def _handle(self, given: LeaseInput, cause: _Cause) -> None:
-        self._state, _ = step(self.TABLE, self._state, given, self, cause)
-
-    def _wait(self, cause: _Cause) -> None:
-        """Do nothing before the answer comes."""
+        self.state, _ = step(self.TABLE, self.state, given, self, cause)
 
     def _ask(self, cause: _Cause) -> None:
         """Ask for the lease."""
         left_s = max(RETRY_S, self._wait_until - cause.now) if self._wait_s is not None else ASK_S
         request = msgspec.structs.replace(self.request, t=int(self.clock_ms()))
-        self._put(Question(self._acquire_key, payloads.encode(request), min(ASK_S, left_s), cause.now))
+        question = Question(self._acquire_key, payloads.encode(request), min(ASK_S, left_s), cause.now)
+        self._waiting = self._unasked = question
 
     def _pause(self, cause: _Cause) -> None:
         """Ask again soon."""
@@ -277,7 +274,8 @@ class LeaseClient:
         assert self._signer is not None
         key = self.keys.key(topics.RPC_RENEW.path)
         timeout_s = ASK_S if self._wait_s is None else min(ASK_S, self._lease_s / 3)
-        self._put(Question(key, self._signer.renewal(key, int(self.clock_ms())), timeout_s, cause.now))
+        question = Question(key, self._signer.renewal(key, int(self.clock_ms())), timeout_s, cause.now)
+        self._waiting = self._unasked = question
 
     def _extend(self, cause: _Cause) -> None:
         """Note how long the lease lasts at least."""
@@ -298,10 +296,7 @@ class LeaseClient:
         signer, self._signer = cause.signer or self._signer, None
         assert signer is not None
         key = self.keys.key(topics.RPC_RELEASE.path)
-        self._put(Question(key, signer.release(key), ASK_S, cause.now, returns=True))
-
-    def _put(self, question: Question) -> None:
-        self._waiting = self._unasked = question
+        self._waiting = self._unasked = Question(key, signer.release(key), ASK_S, cause.now, returns=True)
 
     _HELD: ClassVar[Row] = {
         LeaseInput.DROP: (_give_back, LeaseState.RETURNING),

@@ -13,7 +13,7 @@ from zbridge.bus import Bus, Handle
 from zbridge.errors import BusError
 from zbridge.fleet.messages import Control, Refusal
 from zbridge.lease.lease_client import LeaseClient, Question
-from zbridge.lease.lease_events import LeaseEvent
+from zbridge.lease.lease_events import LeaseEvent, LeaseState
 
 
 class LeaseHolder:
@@ -82,7 +82,7 @@ class LeaseHolder:
     def read_control(self, control: Control) -> list[Refusal]:
         """Take news from ``control``; return what was refused to this program since the last call."""
         news = self.client.read_control(control, self._clock())
-        if self.client.free and control.holder == self.client.request.who:
+        if self.client.state is LeaseState.FREE and control.holder == self.client.request.who:
             self._disown()
         self._settle()
         return news
@@ -126,7 +126,7 @@ class LeaseHolder:
             self._spawn(self._ask(question))
         for event in self.client.events():
             self._on_event(event)
-        if self._closed and self.client.free:
+        if self._closed and self.client.state is LeaseState.FREE:
             self.withdraw()
         self._changed.set()
 

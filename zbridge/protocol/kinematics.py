@@ -17,6 +17,13 @@ Positive = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
 Factor = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
 
 
+def within_full_scale(forward: float, left: float, turn: float) -> Drive:
+    """Return a drive. Above full scale all parts are scaled down alike: the curve stays."""
+    most = max(1.0, abs(forward), abs(left), abs(turn))
+    forward, left, turn = (max(-1.0, min(1.0, part / most)) for part in (forward, left, turn))
+    return Drive(forward=forward, left=left, turn=turn)
+
+
 class Differential(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Two sides of wheels, ``track_m`` apart.
 
@@ -42,8 +49,7 @@ class Differential(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         """Return the drive that makes the two sides this fast; scaled down to full scale where they are faster."""
         forward = (left_m_s + right_m_s) / 2 / self.speed_full_m_s
         turn = (right_m_s - left_m_s) / self.track_m / self.turn_full_rad_s
-        scale = max(1.0, abs(forward), abs(turn))
-        return Drive(forward=forward / scale, turn=turn / scale)
+        return within_full_scale(forward, 0.0, turn)
 
 
 class Factors(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -99,7 +99,7 @@ class Commands:
 
     def _refuse(self, command: str, error: ZbridgeError, sender: CommandSender | None) -> None:
         refused = error if isinstance(error, Refused) else Malformed(str(error))
-        self._enforcer.refuse(command, refused, refused.who or (sender.who if sender is not None else None))
+        self._enforcer.authority.refuse(command, refused, refused.who or (sender.who if sender is not None else None))
 
     def _find(self, key: str) -> Topic:
         if not topics.is_concrete(key):
@@ -149,7 +149,7 @@ class Commands:
         if sender is not None and (isinstance(command, Raw) or _is_autonomous(command)):
             self._enforcer.require_fresh(sender)
             _require_sure(session)
-            self._enforcer.check_motion()
+            self._enforcer.authority.motion.check_motion()
 
     def _command(self, topic: Topic, command: FleetMessage, now: float, sender: CommandSender | None) -> None:
         self._show(topic, self._tell(topic, command, now), sender)
@@ -199,7 +199,7 @@ class Commands:
             self._context.publish(shown, message)
         if outcome.left_out:
             who = sender.who if sender is not None else None
-            self._enforcer.refuse(topic.path.removeprefix("@cmd/"), Unsupported(outcome.left_out), who)
+            self._enforcer.authority.refuse(topic.path.removeprefix("@cmd/"), Unsupported(outcome.left_out), who)
 
 
 def _is_autonomous(command: FleetMessage) -> bool:

@@ -199,7 +199,8 @@ class RobotDevice(Transferable):
 
     def _on_bus(self, connected: bool) -> None:
         if not connected:
-            self.enforcer.bus_lost()
+            self.enforcer.authority.bus_lost()
+            self.enforcer.settle()
         else:
             self._latch_news.returned()
 
@@ -376,7 +377,7 @@ class RobotDevice(Transferable):
         """Stop a moving robot, take leave of it, say so on the bus, and leave the robot's keys to others."""
         self._presence.leave()
         self._refuse_all(_LEAVING)
-        if self.enforcer.authority.moving:
+        if self.enforcer.authority.motion.moving:
             self.enforcer.stop(_LEAVING)
         await asyncio.sleep(min(self._standstill.stopping_s, STOP_REPEAT_S))
         await asyncio.gather(*(connection.close(_LEAVING, LEAVE_S) for connection in self._links))

@@ -59,7 +59,7 @@ class ObservedRobot:
     @property
     def driven(self) -> bool:
         """Whether a program drives the robot, or told it to move by itself."""
-        return self._authority.driven or self._authority.moving
+        return self._authority.motion.driven or self._authority.motion.moving
 
     @property
     def state(self) -> str:

@@ -26,7 +26,6 @@ goodbye to. Who is asked by another gateway that serves the robot asks too.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import math
 import random
@@ -37,41 +36,21 @@ from typing import ClassVar, Protocol
 
 import msgspec
 
-from zbridge.bus import Bus, Handle, IncomingQuery
+from zbridge.bus import Bus
 from zbridge.control.latch import LatchRecord
 from zbridge.errors import BusError
 from zbridge.fleet.topics import KeySpace
 from zbridge.machine import step
 from zbridge.protocol.kept import Exported
-from zbridge.robot.claim import (
-    CLAIM,
-    LOOKS,
-    Claim,
-    ClaimQuestion,
-    OtherGateways,
-    Standing,
-    best_claims,
-    read_question,
-    write,
-)
+from zbridge.robot.claim import LOOKS, Claim, OtherGateways, Standing
+from zbridge.robot.claim_bus import ClaimBus
 
 log = logging.getLogger("zbridge.app.gateway")
 
 LOOK_S = 0.25
 """Seconds between two looks for other gateways while the robot is not owned."""
-SETTLE_S = 0.25
-"""Longest wait for the first connection of the bus."""
 ANNOUNCE_S = 0.1
 """Seconds between the announcement of a claim and the question for others, so that others have seen it."""
-ASK_S = 1.0
-"""Longest wait for the claims of others."""
-WATCH_S = 5.0
-"""Seconds between two looks for others while the robot is served."""
-CLOSE_S = 0.5
-"""The same while there may be another gateway that serves the robot; the least time between two looks."""
-SPREAD_S = 1.0
-"""All gateways of a router find their bus at once, and look each at another moment of so many seconds."""
-_WHO = "gateway"
 
 
 class Served(Protocol):
@@ -136,80 +115,69 @@ class Ownership:
         autonomous: Callable[[], bool] = lambda: False,
         chance: Callable[[], float] = random.random,
     ) -> None:
-        self._bus = bus
-        self._keys = keys
+        self._bus = ClaimBus(bus, keys, chance, claim=self._claim, autonomous=autonomous, merge=self._merge)
+        self._robot = keys.robot
         self._clock = clock
         self._mirror = mirror
-        self._autonomous = autonomous
-        self._chance = chance
         self._state = OwnershipState.LOOKING
         self._looks = 1
         """Looks that must still find nobody."""
-        self._claimed: list[Handle] = []
-        self._shown: list[Handle] = []
         self._held_since: float | None = None
         self._leaving = False
-        self._standing: Callable[[], Standing] = Standing
-        self._merge: Callable[[LatchRecord], object] = lambda record: None
-        self._connected = asyncio.Event()
-        self._was_connected = False
-        self._came = asyncio.Event()
-        """The bus has come, or come back."""
-        self._asked = asyncio.Event()
-        """Another gateway that serves the robot has asked for claims."""
-        self._was_asked = False
-        """Whether another gateway that serves the robot has asked since this one has served it."""
+        self._served: Served | None = None
+        """What serves the robot, while others are watched."""
         self._untold = LOOKS
         """Looks for which latched stops are kept from being lost with this gateway's claim."""
         self._close_until = -math.inf
         """Other gateways are looked for every CLOSE_S until then."""
-        self._watch: Handle | None = None
         self.hands_over = False
         """Whether a successor announces the same claim now: it is no rival."""
         self._waits = False
         """Whether the gateway before still serves the robot."""
 
     def __repr__(self) -> str:
-        return f"<Ownership {self._keys.robot} {self._state.value}>"
+        return f"<Ownership {self._robot} {self._state.value}>"
 
     async def take(self) -> None:
         """Wait until no other gateway claims the robot, then own it.
 
         While a bus that was connected is not, no gateway can be seen, so nothing is taken.
         """
-        await self._settle()
-        others, self._looks = OtherGateways(self._keys.robot), 1
+        await self._bus.settle()
+        others, self._looks = OtherGateways(self._robot), 1
         while True:
-            if self._bus_gone or await self._sees(others):
+            if self._bus.gone or await self._sees(others):
                 found = OwnershipInput.SEEN
             else:
                 found = OwnershipInput.CLEAR if self._looks > 1 else OwnershipInput.LAST_CLEAR
             if self._handle(found) is OwnershipState.CLAIMING:
                 await asyncio.sleep(ANNOUNCE_S)
                 own = self._claim()
-                found = OwnershipInput.OUTBID if self._better(own, await self._claims()) else OwnershipInput.BEST
+                found = (
+                    OwnershipInput.OUTBID if self._bus.outbid(own, await self._bus.claims()) else OwnershipInput.BEST
+                )
                 if self._handle(found) is OwnershipState.OWNING:
                     self._close_until = others.close_until(self._clock())
                     return
             await asyncio.sleep(LOOK_S)
 
     async def watch(self, served: Served) -> None:
-        """Poll for other gateways that serve the robot; return when the robot must be left to one of them."""
-        self._standing, self._merge = lambda: served.standing, served.merge
-        if self._state is OwnershipState.YIELDED:
+        """Look for other gateways that serve the robot; return when the robot must be left to one of them."""
+        self._served = served
+        if self.yielded:
             await served.step_aside()
         self._untold = LOOKS
         while True:
-            await self._next_look()
+            await self._bus.next_look(lambda: self.yielded or self._clock() < self._close_until)
             if not self.hands_over and not self._waits and await self._meet(served) is OwnershipState.LOOKING:
-                log.error("another gateway serves %s: leaving it alone", self._keys.robot)
+                log.error("another gateway serves %s: leaving it alone", self._robot)
                 return
 
     async def _meet(self, served: Served) -> OwnershipState:
         """Compare the own claim with those of others, and follow from it; return the new state."""
         own, state = self._claim(), self._state
         try:
-            claims = await self._claims()
+            claims = await self._bus.claims()
         except BusError:
             return state
         serving = {zid: claim for zid, claim in claims.items() if claim.held_s}
@@ -219,7 +187,7 @@ class Ownership:
         elif state is OwnershipState.YIELDED and not self._owner_gone():
             return state
         found = OwnershipInput.BEST
-        if self._better(own, serving):
+        if self._bus.outbid(own, serving):
             found = OwnershipInput.OUTBID_CONNECTED if served.must_stay else OwnershipInput.OUTBID
         if found is OwnershipInput.OUTBID and self._keeps_latches(own):
             return state
@@ -227,14 +195,14 @@ class Ownership:
             await served.step_aside()
             return self._state
         if self._state is not state:
-            log.error("%s: %s", self._keys.robot, _TURNS[self._state])
+            log.error("%s: %s", self._robot, _TURNS[self._state])
             await (served.step_in() if self._state is OwnershipState.OWNING else served.step_aside())
         served.heard(serving)
         return self._state
 
     def _owner_gone(self) -> bool:
         """Whether the better gateway is gone: after a goodbye one look without it is enough, else :data:`LOOKS`."""
-        if self._bus_gone:
+        if self._bus.gone:
             return False
         self._looks -= 1
         return self._looks <= 0
@@ -242,14 +210,13 @@ class Ownership:
     def _keeps_latches(self, own: Claim) -> bool:
         """Whether the other gateway may not have heard of our latched stops yet; true for so many looks at most."""
         self._untold -= 1
-        return bool(own.latches) and not self._was_asked and self._untold >= 0
+        return bool(own.latches) and not self._bus.was_asked and self._untold >= 0
 
     def export(self) -> Exported | None:
         """Write the claim for a successor of this gateway; None if the robot is not owned."""
         if self._held_since is None:
             return None
-        yielded = self._state is OwnershipState.YIELDED
-        return {"since": self._held_since, "yielded": yielded, "close_until": self._close_until}
+        return {"since": self._held_since, "yielded": self.yielded, "close_until": self._close_until}
 
     def restore(self, claim: Exported) -> None:
         """Own the robot as the gateway before did, once that goes; called instead of :meth:`take`.
@@ -276,11 +243,8 @@ class Ownership:
         self._handle(OwnershipInput.RELEASE)
 
     async def drain(self) -> None:
-        """Wait until all that was published has left this process: what a successor publishes must not overtake it.
-
-        The successor's claim answers the query that tells.
-        """
-        await self._bus.drain(self._keys.key(CLAIM))
+        """Wait until all that was published has left this process: what a successor publishes must not overtake it."""
+        await self._bus.drain()
 
     @property
     def yielded(self) -> bool:
@@ -301,99 +265,49 @@ class Ownership:
         self._looks -= 1
 
     def _announce(self) -> None:
-        self._leaving = self._was_asked = False
-        self._claimed = [self._bus.answer(self._keys.key(CLAIM), self._on_question)]
-        self._show()
+        self._leaving = False
+        self._bus.announce()
 
     def _own(self) -> None:
         self._held_since = self._clock()
 
     def _hide(self) -> None:
-        shown, self._shown = self._shown, []
-        for handle in shown:
-            handle.close()
+        self._bus.hide()
 
     def _show(self) -> None:
-        self._shown = [self._bus.announce(self._keys.alive(_WHO))]
+        self._bus.show()
 
     def _withdraw(self) -> None:
-        handles, self._claimed, self._shown = self._claimed + self._shown, [], []
-        self._held_since, self._standing, self._looks = None, Standing, LOOKS
-        self._merge = lambda record: None
-        for handle in handles:
-            handle.close()
+        self._held_since, self._served, self._looks = None, None, LOOKS
+        self._bus.withdraw()
 
-    # The bus
-
-    async def _settle(self) -> None:
-        if self._watch is None:
-            self._watch = self._bus.watch_connected(self._on_connected)
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(SETTLE_S):
-                await self._connected.wait()
-
-    @property
-    def _bus_gone(self) -> bool:
-        return self._was_connected and not self._connected.is_set()
-
-    def _on_connected(self, up: bool) -> None:
-        self._was_connected = self._was_connected or up
-        if not up:
-            self._connected.clear()
-        elif not self._connected.is_set():
-            self._connected.set()
-            self._came.set()
-
-    async def _next_look(self) -> None:
-        """Wait until it is time to look for others."""
-        await asyncio.sleep(CLOSE_S)
-        if self._state is not OwnershipState.YIELDED and self._clock() >= self._close_until:
-            await _within(WATCH_S - CLOSE_S, self._came, self._asked)
-        if self._came.is_set() and not self._asked.is_set():
-            await _within(self._chance() * SPREAD_S, self._asked)
-        self._came.clear()
-        self._asked.clear()
+    # The own claim, and those of others
 
     async def _sees(self, others: OtherGateways) -> bool:
-        """Query for a token, and for the claim behind it."""
-        token = bool(await self._bus.alive(self._keys.alive(_WHO)))
-        claims = await self._claims() if token else {}
+        """Look for a token, and for the claim behind it."""
+        token = await self._bus.token()
+        claims = await self._bus.claims() if token else {}
         serving = [claim for claim in claims.values() if claim.held_s]
         if serving:
             self._mirror(serving[0].record)
         return others.seen(token, bool(claims), leaving=any(claim.leaving for claim in serving))
 
-    def _better(self, own: Claim, claims: Mapping[str, Claim]) -> bool:
-        """Return whether any of these claims is better than the own one."""
-        return any(claim.better_than(own, zid, self._bus.zid) for zid, claim in claims.items())
-
-    async def _claims(self) -> dict[str, Claim]:
-        """Ask for the claims of others; return the best by session id, the best first. Implausible ones are ignored."""
-        question = write(ClaimQuestion(self._bus.zid, self._held_since is not None, self._autonomous()))
-        return best_claims(await self._bus.ask(self._keys.key(CLAIM), question, timeout_s=ASK_S), self._bus.zid)
-
     def _claim(self) -> Claim:
         if self._held_since is None:
             return Claim()
-        standing = self._standing()
+        standing = self._served.standing if self._served is not None else Standing()
         return Claim(
             held_s=max(self._clock() - self._held_since, 1e-3),
             healthy=standing.healthy,
             connected_s=standing.connected_s,
-            yielded=self._state is OwnershipState.YIELDED or self._waits,
+            yielded=self.yielded or self._waits,
             leaving=self._leaving,
             **msgspec.structs.asdict(standing.record),
         )
 
-    def _on_question(self, question: IncomingQuery) -> None:
-        asker = read_question(question.payload)
-        if asker is not None and asker.zid != self._bus.zid:
-            if asker.serves:
-                self._asked.set()
-                self._was_asked = True
-            if asker.autonomous:
-                self._merge(LatchRecord(autonomous=True))
-        question.answer(write(self._claim()))
+    def _merge(self, record: LatchRecord) -> None:
+        if self._served is not None:
+            self._served.merge(record)
 
     TABLE: ClassVar[dict[OwnershipState, dict[OwnershipInput, tuple[Callable[[Ownership], None], OwnershipState]]]] = {
         OwnershipState.LOOKING: {
@@ -423,13 +337,3 @@ _TURNS = {
     OwnershipState.OWNING: "no other gateway has a better claim: serving it again",
     OwnershipState.YIELDED: "another gateway serves it: leaving the robot alone, and staying connected",
 }
-
-
-async def _within(seconds: float, *events: asyncio.Event) -> None:
-    """Wait so long, or until one of these events."""
-    waits = [asyncio.ensure_future(event.wait()) for event in events]
-    try:
-        await asyncio.wait(waits, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
-    finally:
-        for wait in waits:
-            wait.cancel()

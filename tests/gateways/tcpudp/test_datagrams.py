@@ -23,6 +23,7 @@ from tests.clock import scene_of
 from tests.gateways.tcpudp.frames import ANSWER_TRUE, LISTED, START, bearing, client_settings, framed
 from tests.hq.gateway import KEYS, Gateway
 from zbridge.bus.fake import FakeBus
+from zbridge.clocks import Clocks
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, Status
@@ -74,7 +75,7 @@ class Scene:
             HqSettings(protocol="tcpudp", listen="tcp://127.0.0.1:0"),
             (),
         )
-        self.listener = Listener(plan, "tcpudp", robot, self.manager, self.metrics, lambda: self.now)
+        self.listener = Listener(plan, "tcpudp", robot, self.manager, self.metrics, Clocks(lambda: self.now))
 
     @property
     def now(self) -> float:

@@ -15,6 +15,7 @@ import msgspec
 
 from zbridge.errors import Malformed, ProtocolError
 from zbridge.fleet.messages import Drive
+from zbridge.protocol.kinematics import within_full_scale
 
 LISTED = 4096
 """Most entries of a list in one message."""
@@ -216,9 +217,7 @@ def read_twist(payload: bytes, scale: Scale) -> Drive:
     )
     if not all(map(math.isfinite, parts)):
         raise Malformed("Twist: expected finite numbers")
-    most = max(1.0, *map(abs, parts))
-    forward, left, turn = (max(-1.0, min(1.0, part / most)) for part in parts)
-    return Drive(forward=forward, left=left, turn=turn)
+    return within_full_scale(*parts)
 
 
 def _playback(data: bytes) -> PlaybackRequest:

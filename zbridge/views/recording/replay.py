@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import time
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -242,7 +241,7 @@ class Replay:
 
         shown = self._bus.answer(keys.key(topics.RPC_SESSIONS("gateway").path), answer)
         listeners = [
-            Listener(plan, f"replay-{number}", robot, sessions, metrics, time.monotonic)
+            Listener(plan, f"replay-{number}", robot, sessions, metrics)
             for number, plan in enumerate(self._plan.listeners, 1)
         ]
         robot.open()

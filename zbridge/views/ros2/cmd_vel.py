@@ -8,6 +8,7 @@ from collections.abc import Mapping
 
 from zbridge.errors import Malformed, Unsupported
 from zbridge.fleet.messages import Drive
+from zbridge.protocol.kinematics import within_full_scale
 from zbridge.ros2 import Types
 from zbridge.views.ros2.settings import RobotBody
 
@@ -49,9 +50,7 @@ def drive_of(forward_mps: float, left_mps: float, turn_radps: float, body: Robot
     forward, left = forward_mps / body.speed_full_mps, left_mps / body.speed_full_mps
     if body.wheelbase_m is not None:
         return _steered(forward, forward_mps, left_mps, turn_radps, body.wheelbase_m, body.steer_full_rad)
-    turn = turn_radps / body.turn_full_radps
-    most = max(1.0, abs(forward), abs(left), abs(turn))
-    return Drive(forward=_held(forward / most), left=_held(left / most), turn=_held(turn / most))
+    return within_full_scale(forward, left, turn_radps / body.turn_full_radps)
 
 
 def _steered(

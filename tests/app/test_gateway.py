@@ -16,13 +16,13 @@ import pytest
 
 from tests.certificates import Authority
 from tests.clock import jumping
+from tests.fake_bus import FakeBus
 from tests.proofs import Holder
 from zbridge.app.config import plan
 from zbridge.app.gateway import Gateway
 from zbridge.app.handover.channel import VERSION, HandoverState
 from zbridge.app.joining import RETRY_S, join_bus
 from zbridge.bus import Bus, Handle
-from zbridge.bus.fake import FakeBus
 from zbridge.control.latch_store import LatchStore
 from zbridge.errors import BusError, ConfigError
 from zbridge.fleet.topics import KeySpace

@@ -7,12 +7,12 @@ import logging
 
 import pytest
 
+from tests.fake_bus import FakeBus
 from zbridge.app.config import GatewayPlan, plan
 from zbridge.app.gateway import Gateway
 from zbridge.app.joining import RECONNECTS_S, STUCK_S, SessionUseless, watch_session
 from zbridge.app.runtime import Runtime
 from zbridge.bus import Bus
-from zbridge.bus.fake import FakeBus
 from zbridge.metrics import Metrics
 
 pytestmark = pytest.mark.jumping

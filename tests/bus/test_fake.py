@@ -4,8 +4,8 @@ import zenoh
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from tests.fake_bus import FakeBus, matches, meet
 from zbridge.bus import Sample
-from zbridge.bus.fake import FakeBus, matches, meet
 from zbridge.fleet import topics
 
 CHUNK = st.sampled_from(["a", "b", "@a", "@b"])

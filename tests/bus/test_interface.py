@@ -7,8 +7,8 @@ from collections.abc import AsyncIterator
 import pytest
 
 from tests.bus import Seen
+from tests.fake_bus import FakeBus
 from zbridge.bus import Bus, BusSettings, IncomingQuery
-from zbridge.bus.fake import FakeBus
 from zbridge.bus.zenoh import open_zenoh
 from zbridge.errors import Held
 from zbridge.fleet import topics

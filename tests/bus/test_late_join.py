@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from zbridge.bus.fake import FakeBus
+from tests.fake_bus import FakeBus
 from zbridge.bus.interface import Answer
 from zbridge.bus.late_join import ASK_AFTER_S, ASKED_AT_ONCE, LateJoin
 from zbridge.errors import BusError

@@ -9,7 +9,7 @@ from collections.abc import AsyncIterator
 import pytest
 
 from tests.camera.camera_bytes import HEAD, jpeg, part
-from zbridge.bus.fake import FakeBus
+from tests.fake_bus import FakeBus
 from zbridge.camera import CameraSettings, plan_camera
 from zbridge.camera import camera as cameras
 from zbridge.camera.camera import RETRY_S, Camera

@@ -6,8 +6,8 @@ import asyncio
 
 import pytest
 
+from tests.fake_bus import FakeBus
 from zbridge.bus import Bus, BusSettings
-from zbridge.bus.fake import FakeBus
 from zbridge.cli.bus import echo
 from zbridge.errors import ConfigError
 from zbridge.fleet import topics

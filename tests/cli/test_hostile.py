@@ -17,9 +17,9 @@ import msgpack
 import pytest
 from rich.console import Console
 
+from tests.fake_bus import FakeBus
 from zbridge import cli
 from zbridge.bus import Answer, Bus, Sample
-from zbridge.bus.fake import FakeBus
 from zbridge.cli import LineFormatter
 from zbridge.cli.demo import LiveTable
 from zbridge.cli.drive import DriveRun

@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
+from tests.fake_bus import FakeBus
 from tests.views.recording import files
 from zbridge.bus import BusSettings
-from zbridge.bus.fake import FakeBus
 from zbridge.cli.bus import print_columns
 from zbridge.cli.recording import RecordOptions, ReplayOptions, run_record, run_replay, run_wire, show_info
 from zbridge.errors import ConfigError

@@ -7,8 +7,8 @@ import time
 from types import SimpleNamespace
 from typing import Any
 
+from tests.fake_bus import FakeBus
 from tests.proofs import numbered
-from zbridge.bus.fake import FakeBus
 from zbridge.client import Fleet
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority

@@ -21,8 +21,8 @@ import tests.client
 import zbridge
 import zbridge.client
 from tests.client import at, subscriptions, tokens
+from tests.fake_bus import FakeBus
 from zbridge.bus import BusSettings
-from zbridge.bus.fake import FakeBus
 from zbridge.client import blocking
 from zbridge.client.driver import Driver
 from zbridge.client.feed import WAITING

@@ -19,9 +19,9 @@ import pytest
 
 import tests.client
 from tests.client import LEASE_S, numbered_tokens, raw_ms, settle, subscriptions, tokens
+from tests.fake_bus import FakeBus
 from tests.proofs import lease
 from zbridge.bus import Answer, Handle, Publisher, Sample
-from zbridge.bus.fake import FakeBus
 from zbridge.client import Driver, Fleet, Robot
 from zbridge.client.driver import default_who
 from zbridge.errors import BusError, Code, Held, LeaseLost, Malformed, NeutralFirst, NotReady, Refused, Unsupported

@@ -13,8 +13,8 @@ import pytest
 
 import tests.client
 from tests.client import subscriptions, tokens
+from tests.fake_bus import FakeBus
 from zbridge.bus import Answer, IncomingQuery, Sample
-from zbridge.bus.fake import FakeBus
 from zbridge.client import Fleet, Robot
 from zbridge.client.stops import CONFIRM_S, REPEAT_S
 from zbridge.errors import BusError, NotReady, PayloadError, Refused

@@ -8,7 +8,7 @@ import contextlib
 import pytest
 
 from tests.clock import jumping
-from zbridge.bus.fake import FakeBus
+from tests.fake_bus import FakeBus
 from zbridge.client import Fleet
 from zbridge.client.health import Health, HealthLevel, health, judge, same_addresses
 from zbridge.fleet import payload as payloads

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from tests.client import World
+from tests.fake_bus import FakeBus
 from zbridge.bus import Sample
-from zbridge.bus.fake import FakeBus
 from zbridge.client import Fleet
 from zbridge.client.stops import CONFIRM_S, new_stop
 from zbridge.errors import BusError, Latched, NotReady, Unsupported

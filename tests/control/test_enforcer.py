@@ -8,9 +8,9 @@ import time
 import pytest
 
 from tests.client import Machine
+from tests.fake_bus import FakeBus
 from tests.proofs import numbered
 from zbridge.bus import Sample
-from zbridge.bus.fake import FakeBus
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
 from zbridge.control.context import Conditions, Faults, RobotContext

@@ -9,6 +9,7 @@ from collections.abc import AsyncIterator, Iterator
 import msgspec
 import pytest
 
+from tests.fake_link import FakeLink
 from zbridge.app.handover.channel import VERSION, HandoverState
 from zbridge.errors import HandoverError
 from zbridge.host import child
@@ -30,7 +31,6 @@ from zbridge.host.memory import DEPOSIT_BYTES, SLOTS, MemoryReader
 from zbridge.protocol.kept import Budget
 from zbridge.robot.observer import Boundary, LastStop, StopFrame
 from zbridge.transport import Parcel
-from zbridge.transport.fake import FakeLink
 from zbridge.wire.frames import Partial
 
 

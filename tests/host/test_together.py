@@ -9,11 +9,11 @@ from collections.abc import AsyncIterator
 
 import pytest
 
+from tests.fake_bus import FakeBus
 from zbridge.app import GatewayPlan, plan
 from zbridge.app.gateway import Gateway, Neighbourhood
 from zbridge.app.joining import RECONNECTS_S, STUCK_S
 from zbridge.bus import Bus
-from zbridge.bus.fake import FakeBus
 from zbridge.errors import LinkError
 from zbridge.host.settings import HostSettings
 from zbridge.host.together import LONGEST_PAUSE_S, Together

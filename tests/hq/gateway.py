@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from tests.fake_bus import FakeBus
 from tests.proofs import numbered
-from zbridge.bus.fake import FakeBus
 from zbridge.bus.interface import IncomingQuery, Sample
 from zbridge.control.authority import Authority
 from zbridge.errors import Refused, Stale

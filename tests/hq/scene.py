@@ -14,8 +14,9 @@ from unittest import mock
 
 import numpy as np
 
+from tests.fake_bus import FakeBus
+from tests.fake_link import FakeLink
 from tests.hq.gateway import KEYS, Gateway
-from zbridge.bus.fake import FakeBus
 from zbridge.clocks import Clocks
 from zbridge.errors import EncodeError, ProtocolError
 from zbridge.fleet import payload as payloads
@@ -32,7 +33,6 @@ from zbridge.protocol.address import Address
 from zbridge.protocol.plugin import HqSide, Protocol, Send, Telemetry
 from zbridge.protocol.session import Limits, Role, Session, State
 from zbridge.protocol.session_table import ClientIds, SessionTable
-from zbridge.transport.fake import FakeLink
 from zbridge.transport.link import Receiver
 
 STATUS = Status(state="established", protocol="toy")

@@ -10,9 +10,9 @@ import msgspec
 import pytest
 
 from tests.bounds import most_kept
+from tests.fake_bus import FakeBus
 from tests.hq.gateway import KEYS, Gateway
 from tests.hq.scripts import scripts
-from zbridge.bus.fake import FakeBus
 from zbridge.errors import BusError, Code, Refused
 from zbridge.fleet import topics
 from zbridge.fleet.messages import (

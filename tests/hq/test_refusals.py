@@ -9,8 +9,8 @@ from typing import Any
 import msgpack
 import pytest
 
+from tests.fake_bus import FakeBus
 from zbridge.bus import IncomingQuery
-from zbridge.bus.fake import FakeBus
 from zbridge.errors import Code, NotReady, Refused
 from zbridge.fleet import topics
 from zbridge.fleet.messages import TOLD

@@ -3,7 +3,7 @@
 import pytest
 
 from tests.bounds import most_kept
-from zbridge.bus.fake import FakeBus
+from tests.fake_bus import FakeBus
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, FleetMessage, Pose, Reading, Status, Switch

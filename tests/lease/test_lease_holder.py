@@ -7,10 +7,10 @@ from collections.abc import Coroutine
 from typing import Any
 
 from tests.clock import jumping
+from tests.fake_bus import FakeBus
 from tests.lease import decide
 from tests.proofs import numbered
 from zbridge.bus import IncomingQuery
-from zbridge.bus.fake import FakeBus
 from zbridge.control.authority import Authority
 from zbridge.errors import BusError
 from zbridge.fleet import payload as payloads

@@ -28,9 +28,10 @@ import msgpack
 from gateways.tcpudp.options import TcpUdpOptions
 from gateways.tcpudp.translate import TcpUdpRobot
 from tests.clock import JumpingLoop
+from tests.fake_bus import FakeBus, FakeQuery, meet
+from tests.fake_link import FakeLink
 from tests.proofs import Holder, numbered, packed
 from zbridge.bus import Handle, IncomingQuery, PriorityClass, Sample
-from zbridge.bus.fake import FakeBus, FakeQuery, meet
 from zbridge.bus.interface import Sort
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
@@ -46,7 +47,6 @@ from zbridge.robot.connection import LinkSettings
 from zbridge.robot.device import ControlParts, RobotDevice
 from zbridge.robot.observer import Observer
 from zbridge.transport.conversation import Conversation
-from zbridge.transport.fake import FakeLink
 
 ADDRESS = Address("robot.test", 11001)
 LISTED = b"\x0b\x00\x00\x001.1,1.2,1.3"

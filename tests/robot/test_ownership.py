@@ -13,9 +13,9 @@ from unittest.mock import ANY
 import msgpack
 import pytest
 
+from tests.fake_bus import FakeBus
 from tests.tables import documented, executed
 from zbridge.bus import Answer, Handle, IncomingQuery, PriorityClass
-from zbridge.bus.fake import FakeBus
 from zbridge.bus.interface import Sort
 from zbridge.control.latch import LatchRecord
 from zbridge.fleet.messages import Latch

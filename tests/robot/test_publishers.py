@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from zbridge.bus.fake import FakeBus
+from tests.fake_bus import FakeBus
 from zbridge.control.context import Conditions
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Reading, Switch

@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from zbridge.bus.fake import FakeQuery
+from tests.fake_bus import FakeQuery
 from zbridge.errors import Refused
 from zbridge.fleet import topics
 from zbridge.robot.queries import WAITING, PendingQueries

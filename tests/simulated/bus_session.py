@@ -9,9 +9,9 @@ from typing import Any
 
 import msgspec
 
+from tests.fake_bus import matches, meet
 from tests.simulated.bus import NEWS_S, Fabric, SimSession
 from tests.simulated.engine import THREAD_S
-from zbridge.bus.fake import matches, meet
 from zbridge.bus.inbox import Inbox
 from zbridge.bus.interface import Answer, PriorityClass, Sample
 from zbridge.bus.late_join import LateJoin

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from tests.fake_link import FakeLink
 from tests.protocol.test_session import LIMITS, Toy
 from zbridge.errors import NotReady
 from zbridge.metrics import Count
@@ -14,7 +15,6 @@ from zbridge.protocol.session import LINGER_S, State
 from zbridge.protocol.traffic import SourceClaims
 from zbridge.transport.accepted import ClientConversation
 from zbridge.transport.conversation import ConversationHooks
-from zbridge.transport.fake import FakeLink
 from zbridge.transport.link import STALLED_S
 from zbridge.transport.reading import BURST_S, FairShare
 

@@ -6,8 +6,8 @@ import asyncio
 
 import pytest
 
+from tests.fake_bus import FakeBus
 from tests.transport.recorder import Recorder
-from zbridge.bus.fake import FakeBus
 from zbridge.errors import LinkError
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import ZenohAddress

@@ -11,9 +11,9 @@ import pytest
 
 from tests.certificates import Authority
 from tests.clock import jumping
+from tests.fake_link import FakeLink
 from zbridge.errors import LinkError
 from zbridge.transport import TlsLink, server_context
-from zbridge.transport.fake import FakeLink
 from zbridge.transport.link import Link, Receiver
 
 HANDSHAKE_S = 5.0

@@ -7,10 +7,10 @@ import pytest
 
 from tests.bounds import most_kept
 from tests.clock import jumping
+from tests.fake_link import FakeLink
 from tests.transport.recorder import LOCAL, Recorder, connected, heard_by, udp_socket, until
 from zbridge.metrics import Count
 from zbridge.transport import udp
-from zbridge.transport.fake import FakeLink
 from zbridge.transport.tcp import connect, listen
 from zbridge.transport.udp import DatagramHub
 

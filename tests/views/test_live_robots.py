@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from zbridge.bus.fake import FakeBus
+from tests.fake_bus import FakeBus
 from zbridge.fleet.messages import Switch
 from zbridge.fleet.payload import encode, measured_ns
 from zbridge.metrics import Metrics

@@ -1,7 +1,7 @@
 """A link (one transport connection to a peer) and its receiver, as each kind of them begins. Opens nothing itself.
 
 Links are :class:`~zbridge.transport.tcp.TcpLink`, :class:`~zbridge.transport.serial.SerialLink`,
-:class:`~zbridge.transport.samples.ZenohLink` and, for tests, :class:`~zbridge.transport.fake.FakeLink`.
+:class:`~zbridge.transport.samples.ZenohLink`.
 """
 
 from __future__ import annotations

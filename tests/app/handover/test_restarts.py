@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 
+from tests.fake_bus import FakeBus
 from zbridge.app.config import GatewayPlan, plan
 from zbridge.app.handover import restarts as module
 from zbridge.app.handover.channel import VERSION, HandoverState
 from zbridge.app.handover.restarts import ClaimPart, Restarts
 from zbridge.app.handover.sequence import ColdStart, Incoming
-from zbridge.bus.fake import FakeBus
 from zbridge.errors import NotReady, Refused
 from zbridge.fleet.topics import KeySpace
 from zbridge.protocol.kept import Budget, Exported
@@ -101,7 +101,7 @@ async def asked(restarts: Restarts, bus: FakeBus, key: str = ASKED) -> Any:
     entry = restarts.answer(bus)
     queries: list[Any] = []
     ((_, handler, _),) = bus.network.queryables
-    from zbridge.bus.fake import FakeQuery
+    from tests.fake_bus import FakeQuery
 
     queries.append(FakeQuery(ASKED, asked=key))
     handler(queries[0])

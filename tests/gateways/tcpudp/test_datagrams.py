@@ -20,9 +20,9 @@ from gateways.tcpudp import PROTOCOL
 from gateways.tcpudp.options import TcpUdpHqOptions
 from gateways.tcpudp.session import robot_role as sessions
 from tests.clock import scene_of
+from tests.fake_bus import FakeBus
 from tests.gateways.tcpudp.frames import ANSWER_TRUE, LISTED, START, bearing, client_settings, framed
 from tests.hq.gateway import KEYS, Gateway
-from zbridge.bus.fake import FakeBus
 from zbridge.clocks import Clocks
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics

@@ -9,9 +9,10 @@ import pytest
 
 from gateways.wc2ec.options import Wc2EcOptions
 from gateways.wc2ec.translate import Wc2EcRobot
+from tests.fake_bus import FakeBus
+from tests.fake_link import FakeLink
 from tests.gateways.wc2ec.golden import DISTANCE, data, registration
 from zbridge.bus import Publisher
-from zbridge.bus.fake import FakeBus
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
 from zbridge.control.context import Conditions, Faults, RobotContext
@@ -23,7 +24,6 @@ from zbridge.robot.connection import LinkSettings
 from zbridge.robot.device import ControlParts, RobotDevice
 from zbridge.robot.names import HOUR_S, NAMES
 from zbridge.transport.conversation import Conversation
-from zbridge.transport.fake import FakeLink
 
 pytestmark = pytest.mark.jumping
 

@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
+from tests.fake_bus import FakeBus
 from tests.views.foxglove.test_hub import Looking, ids
-from zbridge.bus.fake import FakeBus
 from zbridge.client import Fleet
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, Device, Devices, FleetMessage, Latch, Pose, Reading, Switch

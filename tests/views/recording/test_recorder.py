@@ -15,9 +15,9 @@ import msgpack
 import pytest
 from mcap.reader import make_reader
 
+from tests.fake_bus import FakeBus
 from tests.machine import Patience
 from tests.views.recording import files
-from zbridge.bus.fake import FakeBus
 from zbridge.errors import ZbridgeError
 from zbridge.fleet import topics
 from zbridge.fleet.topics import KeySpace

@@ -11,9 +11,9 @@ from typing import Any
 import msgpack
 import pytest
 
+from tests.fake_bus import FakeBus
 from tests.machine import Patience
 from tests.views.recording import files
-from zbridge.bus.fake import FakeBus
 from zbridge.errors import ConfigError, Held
 from zbridge.fleet import topics
 from zbridge.views.recording.replay import Replay, ReplayPlan, plan_listeners, plan_names, survey

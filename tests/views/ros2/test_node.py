@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
+from tests.fake_bus import FakeBus
 from zbridge.bus import Handle, Sample
-from zbridge.bus.fake import FakeBus
 from zbridge.fleet.messages import Device, Devices, Pose, Reading, Scan, Scanner
 from zbridge.fleet.payload import encode
 from zbridge.fleet.topics import KeySpace

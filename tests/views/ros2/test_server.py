@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from zbridge.bus.fake import FakeBus
+from tests.fake_bus import FakeBus
 from zbridge.errors import ConfigError
 from zbridge.metrics import Metrics
 from zbridge.ros2 import types_of

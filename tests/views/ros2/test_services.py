@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from zbridge.bus.fake import FakeBus, FakeQuery
+from tests.fake_bus import FakeBus, FakeQuery
 from zbridge.errors import BusError, Held, Malformed, NotReady
 from zbridge.metrics import Metrics
 from zbridge.ros2 import types_of

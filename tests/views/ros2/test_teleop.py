@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from zbridge.bus.fake import FakeBus
+from tests.fake_bus import FakeBus
 from zbridge.bus.interface import PriorityClass, Sample
 from zbridge.client import Fleet
 from zbridge.fleet import topics

@@ -134,7 +134,7 @@ def test_eight_robots_of_which_one_crashes_and_one_gets_a_faulty_file(host: Host
     assert former.ended
 
     (host.folder / "r7.toml").unlink()
-    host.reload("is gone")
+    host.reload("was removed")
     until(lambda: host.robots[7].ended, what="the end of one gateway")
 
     os.kill(supervisor.gateway("r0"), signal.SIGUSR2)

@@ -10,7 +10,7 @@ from tests.client import World
 from tests.fake_bus import FakeBus
 from zbridge.bus import Sample
 from zbridge.client import Fleet
-from zbridge.client.stops import CONFIRM_S, new_stop
+from zbridge.client.stops import CONFIRM_S, StopWaits, new_stop
 from zbridge.errors import BusError, Latched, NotReady, Unsupported
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -80,8 +80,7 @@ async def test_a_robot_that_the_stop_of_all_did_not_reach_is_latched_by_name_and
 async def test_each_robot_has_its_outcome_confirmed_or_not() -> None:
     world = World("r1", "r2", "r3", "r4")
     world.gateways["r2"].publish(topics.STATUS, Status(state="offline", reason="no route"))
-    stalled = "the robot's link is stalled: it is not driven"
-    world.gateways["r4"].publish(topics.STATUS, Status(state="established", reason=f"{stalled}; another condition"))
+    world.gateways["r4"].publish(topics.STATUS, Status(state="established", stalled=True))
     await world.gateways["r3"].vanish()
     world.bus.announce("fleet/r3/@alive/gateway")
     asked_at = world.loop.time()
@@ -89,6 +88,7 @@ async def test_each_robot_has_its_outcome_confirmed_or_not() -> None:
     assert world.loop.time() - asked_at < CONFIRM_S + 0.5
     assert outcomes["r1"] is None
     assert isinstance(outcomes["r2"], NotReady)
+    assert isinstance(outcomes["r4"], StopWaits)
     assert str(outcomes["r4"]) == "r4: stop accepted, but it waits: the robot's link is stalled"
     assert isinstance(outcomes["r3"], BusError)
     assert world.gateways["r2"].control.state == "latched", "its gateway keeps it"

@@ -149,6 +149,7 @@ async def test_a_link_that_takes_nothing_is_said_to_be_so_and_all_but_stops_is_r
     async with established(deadman_s=5.0) as rig:
         await play(rig, "drive 1; stall 0.31; drive 2")
         assert rig.last("status")["reason"] == f"{STALLED}: it is not driven"
+        assert rig.last("status")["stalled"] is True
         assert rig.metrics.total("link_stalls") == 1
         assert rig.metrics.total("drives_unwritten") >= 19
         (answer,) = rig.ask("pose").replies

@@ -24,7 +24,6 @@ ASKED_S = 5.0
 """Longest time that a program takes to confirm a stop."""
 SILENCE_S = 2.5
 """Seconds after packet 4 in which a TCP/UDP robot gets nothing but a packet 7."""
-STALLED = "the robot's link is stalled"
 SHOWN_S = 1.0
 """Seconds after which a program that asks for ``status`` has what the gateway shows."""
 ON_ITS_WAY_S = 0.15
@@ -60,7 +59,7 @@ class StopRules:
             self._on_done(who, fields[0])
         elif what == "puts" and who in self._checker.gateways and fields[0].endswith("/status"):
             status = read(fields[1])
-            if status.get("state") == "established" and STALLED not in (status.get("reason") or ""):
+            if status.get("state") == "established" and not status.get("stalled"):
                 self._apart_since[who] = math.inf
             elif self._apart_since.get(who, math.inf) == math.inf:
                 self._apart_since[who] = self._world.now

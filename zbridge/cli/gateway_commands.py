@@ -12,10 +12,9 @@ from zbridge.bus.tls.membership import Right, lacking
 from zbridge.cli.bus import console, errors, joined
 from zbridge.client import connect
 from zbridge.client.driver import default_who
-from zbridge.client.stops import Outcome
+from zbridge.client.stops import Outcome, StopWaits
 from zbridge.errors import BusError, NotReady, Refused
 from zbridge.fleet import topics
-from zbridge.fleet.messages import LINK_BLOCKED
 from zbridge.fleet.printable import shown
 from zbridge.fleet.topics import KeySpace, is_name, split_key
 
@@ -72,7 +71,7 @@ def summary(outcomes: Mapping[str, Outcome], done: str) -> str:
 
 def _finding(error: Exception) -> str:
     if isinstance(error, NotReady):
-        return "not reached" if LINK_BLOCKED in str(error) else "offline"
+        return "not reached" if isinstance(error, StopWaits) else "offline"
     return "refused" if isinstance(error, Refused) else "did not confirm"
 
 

@@ -21,7 +21,7 @@ from zbridge.bus.tls.membership import Right, lacking
 from zbridge.errors import BusError, BusRefused, NotReady, PayloadError, Refused, refusal
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import LINK_BLOCKED, Control, Latch, Refusal, Status, Stop, Unlatch
+from zbridge.fleet.messages import Control, Latch, Refusal, Status, Stop, Unlatch
 from zbridge.fleet.topics import KeySpace, Topic
 
 REPEAT_S = 0.25
@@ -39,6 +39,11 @@ _WHO, _REASON = 64, 100
 """Characters that fit into a stop, with room for non-ASCII ones."""
 
 T = TypeVar("T")
+
+
+class StopWaits(NotReady):
+    """The gateway has the stop, and the robot gets it when its link works again."""
+
 
 Outcome = Refused | BusError | None
 """The outcome for a robot: None if it was confirmed."""
@@ -86,8 +91,8 @@ async def stop_robot(bus: Bus, keys: KeySpace, stop: Stop) -> None:
     if isinstance(status, Status) and status.state != "established":
         why = status.reason or "no reason known"
         raise NotReady(f"{keys.robot}: stop accepted, but the robot is {status.state}: {why}")
-    if isinstance(status, Status) and LINK_BLOCKED in (status.reason or ""):
-        raise NotReady(f"{keys.robot}: stop accepted, but it waits: {LINK_BLOCKED}")
+    if isinstance(status, Status) and status.stalled is True:
+        raise StopWaits(f"{keys.robot}: stop accepted, but it waits: the robot's link is stalled")
 
 
 async def stop_robots(bus: Bus, realm: str, robots: Iterable[str], stop: Stop) -> dict[str, Outcome]:

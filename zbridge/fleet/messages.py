@@ -175,12 +175,11 @@ class LinkStatus(msgspec.Struct, frozen=True):
 RobotState = Literal["offline", "connecting", "handshaking", "established", "closing"]
 
 
-LINK_BLOCKED = "the robot's link is stalled"
-"""Stands in the reason of a :class:`Status` while nothing that is written reaches the robot."""
-
-
 class Status(FleetMessage, frozen=True):
-    """Whether the robot can be used, and what was negotiated with it. host: the machine of its gateway."""
+    """Whether the robot can be used, and what was negotiated with it. host: the machine of its gateway.
+
+    stalled: True while the robot's link acknowledges nothing: what it is sent waits.
+    """
 
     state: RobotState
     reason: str | None = None
@@ -190,6 +189,7 @@ class Status(FleetMessage, frozen=True):
     features: tuple[str, ...] = ()
     links: tuple[LinkStatus, ...] = ()
     host: str | None = None
+    stalled: bool | UnsetType = UNSET
 
 
 class Refusal(msgspec.Struct, frozen=True, kw_only=True):

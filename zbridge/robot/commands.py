@@ -15,12 +15,13 @@ from zbridge.control.events import CommandSender
 from zbridge.errors import Code, EncodeError, Malformed, NotReady, PayloadError, Refused, Unsupported, ZbridgeError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import LINK_BLOCKED, Drive, FleetMessage, Mode, Motor, Raw
+from zbridge.fleet.messages import Drive, FleetMessage, Mode, Motor, Raw
 from zbridge.fleet.topics import Delivery, Topic
 from zbridge.lease.proof import Verifier
 from zbridge.protocol.plugin import Outcome
 from zbridge.protocol.session import Session, State
 
+LINK_BLOCKED = "the robot's link is stalled"
 _MOTIONS = (Drive, Motor)
 _ESTABLISHED = State.ESTABLISHED
 WRITE_S = 0.4

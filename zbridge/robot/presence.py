@@ -7,14 +7,16 @@ import logging
 import socket
 from typing import Any
 
+from msgspec import UNSET
+
 from zbridge.control.context import RobotContext
 from zbridge.control.enforcer import Enforcer
 from zbridge.control.standstill import Standstill
 from zbridge.errors import Refused
 from zbridge.fleet import topics
-from zbridge.fleet.messages import LINK_BLOCKED, Status
+from zbridge.fleet.messages import Status
 from zbridge.protocol.session import Session, State
-from zbridge.robot.commands import Commands
+from zbridge.robot.commands import LINK_BLOCKED, Commands
 from zbridge.robot.connection import Links
 from zbridge.robot.observer import Observer
 from zbridge.robot.queries import PendingQueries
@@ -117,6 +119,7 @@ class Presence:
                 features=agreed.features if agreed is not None else (),
                 links=tuple(connection.status() for connection in self._links),
                 host=self._host,
+                stalled=self._commands.blocked or UNSET,
             ),
         )
 

@@ -49,7 +49,8 @@ def caught_by(mutant: Mutant, folder: Path, seconds: float, seed: int) -> str | 
     """Return the first violation that a broken variant shows; None where it shows none."""
     for package in ("zbridge", "gateways", "tests/simulated"):
         shutil.copytree(ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
-    shutil.copy(ROOT / "tests/__init__.py", folder / "tests/__init__.py")
+    for module in ("__init__.py", "fake_bus.py"):
+        shutil.copy(ROOT / "tests" / module, folder / "tests" / module)
     broken = folder / mutant.file
     text = broken.read_text()
     if mutant.old not in text:

@@ -288,7 +288,10 @@ def _deliver(session: SimSession, key: str, payload: bytes, attachment: bytes | 
     for bus in tuple(session.buses):
         for key_expr, store in tuple(bus.subscribers):
             if meet(key_expr, key):
-                store(Sample(key, payload, attachment))
+                try:
+                    store(Sample(key, payload, attachment))
+                except Exception as error:  # Zenoh loses such a sample, and continues
+                    session.fabric.world.errors.append(f"{session.process.name}: a sample of {key}: {error!r}")
 
 
 class Asked:

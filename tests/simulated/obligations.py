@@ -95,9 +95,7 @@ class Obligations:
             self._connected_at = self.world.now
         if what == "connected":
             grant = self.checker.current.get(self.checker.by_host.get(fields[0][0], ""))
-            if (
-                grant is not None
-            ):  # docs/control.md, "require neutral": a robot that was lost is stopped when it comes back
+            if grant is not None:  # a robot that was lost is stopped when it comes back: docs/control.md
                 grant.autonomous = False
         elif what in ("drops", "ignores"):
             self._dropped_at = self.world.now

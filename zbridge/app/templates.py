@@ -80,7 +80,7 @@ COMMON_TEMPLATE = (
 [control]
 lease_s = 3.0                           # most a holder may ask for: a lease not renewed for so long ends
 deadman_s = 2.0                         # most a holder may ask for: motion without a fresh command ends
-max_age_s = 0.4                         # motion that the network held up for longer is refused; 0: none is
+max_age_s = 0.4                         # motion that the network delayed longer is refused; 0: off
 # rate_hz = 50.0                        # drives a second that are carried out; further ones are refused
 # slew_per_s = 2.0                      # how fast a drive may grow, full scales a second; braking is not limited
 idle_stop_s = 1.0                       # seconds between stops while nobody drives, in case the robot lost one;

@@ -102,7 +102,7 @@ class Holder(msgspec.Struct):
         """Return whether the holder repeats its own question because the grant did not reach it.
 
         That is a later question of the same name and liveliness token, while the lease was not used. A question that
-        was held up on the way is an earlier one: it must not end the lease that was granted to a later one.
+        was delayed on the way is an earlier one: it must not end the lease that was granted to a later one.
         """
         unused = not self.numbers and self.alive is not None and self.asked_ms is not UNSET
         same = (request.who, request.alive) == (self.who, self.alive)

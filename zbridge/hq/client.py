@@ -153,7 +153,7 @@ class Client:
         self.close()
 
     def sweep(self) -> None:
-        """End a client that takes nothing, is silent for too long, or sends only malformed messages."""
+        """End a client that is stalled, is silent for too long, or sends only malformed messages."""
         traffic, idle_s = self.session.traffic, self._context.settings.idle_s
         self._stalled_s = max(0.0, self._stalled_s + (SWEEP_S if self.conversation.stalled else -SWEEP_S))
         self._silent_s = self._silent_s + SWEEP_S if traffic.bytes_in == self._bytes_in else 0.0

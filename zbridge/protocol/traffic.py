@@ -34,7 +34,7 @@ class SourceClaims(ABC):
 
     @abstractmethod
     def claims(self, datagram: bytes, port: int) -> bool:
-        """Tell whether a datagram from a port of the peer's host that is nobody's source yet is from the peer."""
+        """Return whether a datagram from a port of the peer's host that is nobody's source yet is from the peer."""
 
     @abstractmethod
     def rivalled(self, now: float) -> None:
@@ -42,7 +42,7 @@ class SourceClaims(ABC):
 
     @abstractmethod
     def stray(self, datagram: bytes) -> None:
-        """Look at a datagram of the peer's host that nobody claimed; raise Refused to tell the peer why."""
+        """Inspect a datagram of the peer's host that nobody claimed; raise Refused to tell the peer why."""
 
 
 class Traffic(msgspec.Struct):

@@ -86,7 +86,7 @@ class ClaimBus:
         self._asked.clear()
 
     async def token(self) -> bool:
-        """Look for the token of any gateway of the robot."""
+        """Query for the token of any gateway of the robot."""
         return bool(await self._bus.alive(self._token))
 
     async def claims(self) -> dict[str, Claim]:

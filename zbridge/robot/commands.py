@@ -184,7 +184,7 @@ class Commands:
             self._show(topic, outcome, sender)
 
     def _tell(self, topic: Topic, command: FleetMessage, now: float) -> Outcome:
-        """Tell the robot; refuse the command where the protocol's own code raises what it must not."""
+        """Tell the robot; refuse the command if the protocol's own code raises an exception."""
         try:
             outcome = self._robot.command(topic, command, now)
             if outcome is None:

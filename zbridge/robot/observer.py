@@ -67,7 +67,7 @@ class ObservedRobot:
         return self._links.first.state
 
     def last_stop(self) -> LastStop:
-        """Give what stops the robot now; see :class:`LastStop`."""
+        """Return what stops the robot now; see :class:`LastStop`."""
         context, driven, state = self._context, self.driven, self.state
         session = context.robot.driving
         if self.aside or session is None or session.state is not State.ESTABLISHED:
@@ -83,12 +83,12 @@ class ObservedRobot:
         return LastStop(driven, stop, session.outbox.gap_s, state)
 
     def boundary(self, name: str) -> Boundary:
-        """Give where the outgoing stream of the link of this name stands; see :class:`Boundary`."""
+        """Return where the outgoing stream of the link of this name stands; see :class:`Boundary`."""
         conversation = self._links.conversation(name)
         return Boundary(conversation is not None and not conversation.stalled)
 
     def partial(self, name: str, most_bytes: int) -> Partial | None:
-        """Give the incomplete frame that came by the link of this name; see :data:`Resume`."""
+        """Return the incomplete frame that came by the link of this name; see :data:`Resume`."""
         conversation = self._links.conversation(name)
         return conversation.session.partial(most_bytes) if conversation is not None else None
 

@@ -162,7 +162,7 @@ class Ownership:
             await asyncio.sleep(LOOK_S)
 
     async def watch(self, served: Served) -> None:
-        """Look for other gateways that serve the robot; return when the robot must be left to one of them."""
+        """Poll for other gateways that serve the robot; return when the robot must be left to one of them."""
         self._served = served
         if self.yielded:
             await served.step_aside()
@@ -284,7 +284,7 @@ class Ownership:
     # The own claim, and those of others
 
     async def _sees(self, others: OtherGateways) -> bool:
-        """Look for a token, and for the claim behind it."""
+        """Query for a token, and for the claim behind it."""
         token = await self._bus.token()
         claims = await self._bus.claims() if token else {}
         serving = [claim for claim in claims.values() if claim.held_s]

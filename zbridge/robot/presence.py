@@ -84,7 +84,7 @@ class Presence:
             self.publish_status()
 
     def stalled(self, name: str, stalled: bool) -> None:
-        """Drive no robot whose first link takes nothing: it would obey late, or lose its stop with the rest."""
+        """Drive no robot whose first link is stalled: it would obey late, or lose its stop with the rest."""
         if name != self._links.first.name:
             return
         self._commands.blocked = stalled

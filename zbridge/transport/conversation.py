@@ -4,9 +4,9 @@ A process that was frozen finds its timers overdue and the peer's bytes unread. 
 (``before``), waiting input, and the session's timers :data:`CATCH_UP_S` later. So no session ends for a silence that
 the process itself caused.
 
-``pump`` is the one place that writes. Everything that may give the session something to write, or change its state,
-ends with it: bytes, a timer, a command of the device. What the protocol's own code raises in any of them ends its
-session, with the place as the reason.
+Only ``pump`` writes. Everything that may give the session something to write, or change its state, ends with it: bytes,
+a timer, a command of the device. An exception of the protocol's own code in any of them ends its session, with file and
+line as the reason.
 
 A link is stalled when bytes have waited for their acknowledgement for longer than STALLED_S. From then on nothing is
 written: a robot would read what piles up as one packet, and lose it. The stall ends, before the next write, when all is
@@ -35,10 +35,10 @@ from zbridge.transport.transferable import Parcel
 log = logging.getLogger("zbridge.link")
 
 LATE_S = 0.02
-"""A session's timer that fires this late shows that the process, or the machine, was held up; seconds."""
+"""A session's timer that fires this late shows that the process, or the machine, was delayed; seconds."""
 CATCH_UP_S = 0.05
-"""Seconds for which such a process reads before the timers of the session run."""
-LOOK_S = 0.05
+"""Seconds for which such a process reads before it runs the session's timers."""
+CHECK_S = 0.05
 """Seconds between two checks of a stalled link."""
 _ESTABLISHED, _CLOSED = State.ESTABLISHED, State.CLOSED
 
@@ -47,14 +47,14 @@ _P = ParamSpec("_P")
 
 
 class ConversationHooks(msgspec.Struct, frozen=True, kw_only=True):
-    """What a conversation calls, counts and uses of whoever holds it."""
+    """What a conversation calls, counts and uses of its owner."""
 
     deliver: Callable[[list[Any]], None] = lambda messages: None
     """Takes the messages of each read."""
     changed: Callable[[], object] = lambda: None
     """Called on every change of the session's state."""
     before: Callable[[], object] = lambda: None
-    """Called before each read and write: what must leave first may be given to the session there."""
+    """Called before each read and write, to pass the session what must leave first."""
     read: Callable[[], object] | None = None
     """Called when the bytes of a read have been cut into frames."""
     stalled: Callable[[bool], object] = lambda stalled: None
@@ -62,13 +62,13 @@ class ConversationHooks(msgspec.Struct, frozen=True, kw_only=True):
     linked: Callable[[Link, bool], object] = lambda link, up: None
     """Called when the link is up (True), and when it is gone (False)."""
     refused: Callable[[Refused], object] = lambda refusal: None
-    """Told which datagrams in the peer's name did not come from the peer."""
+    """Called for datagrams in the peer's name that did not come from the peer."""
     may_warn: Callable[[str], bool] = lambda kind: True
-    """Says whether a warning of this kind may be logged now."""
+    """Returns whether a warning of this kind may be logged now."""
     clock: Callable[[], float] | None = None
     """Seconds on the loop's time line; by default the loop's own clock, which may be a millisecond behind."""
     share: FairShare | None = None
-    """Of a processor; who sends more than can be worked off within it is not read meanwhile."""
+    """Of a processor; a peer that sends more than can be processed within it is not read meanwhile."""
     malformed: Count = msgspec.field(default_factory=Count)
     foreign: Count = msgspec.field(default_factory=Count)
     rivals: Count = msgspec.field(default_factory=Count)
@@ -77,7 +77,7 @@ class ConversationHooks(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def then_pump(step: Callable[Concatenate[_C, _P], None]) -> Callable[Concatenate[_C, _P], None]:
-    """Let a step end with ``pump``; a fault of the protocol's own code ends the session."""
+    """Let a step end with ``pump``; an exception of the protocol's own code ends it."""
 
     @wraps(step)
     def contained(self: _C, /, *args: _P.args, **kwargs: _P.kwargs) -> None:
@@ -109,7 +109,7 @@ class Conversation(Receiver):
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at: float | None = None
         self._reads_until = -math.inf
-        """When the session's timers run again: the process was held up, and reads first."""
+        """When the session's timers run again: the process was delayed, and reads first."""
         self._seen = (session.state, session.busy, session.doubts)
         self._malformed_logged = 0
         self._blocked = False
@@ -206,21 +206,21 @@ class Conversation(Receiver):
             if session.state is _CLOSED:
                 self._end()
                 return
-            if changed:  # who was notified may have given the session something to write
+            if changed:  # the code that was notified may have given the session something to write
                 writes_at, waited_s = self._write()
             now = self._clock()
             at = self._reads_until if now < self._reads_until else session.deadline(writing=False)
             if writes_at is not None and (at is None or writes_at < at):
                 at = writes_at
             if waited_s or self._blocked:
-                look_at = now + (LOOK_S if self._blocked else max(0.0, STALLED_S - waited_s) + LOOK_S / 10)
-                at = look_at if at is None else min(at, look_at)
+                check_at = now + (CHECK_S if self._blocked else max(0.0, STALLED_S - waited_s) + CHECK_S / 10)
+                at = check_at if at is None else min(at, check_at)
             self._set_timer(at)
         except Exception as error:
             self._fault(error)
 
     def _write(self) -> tuple[float | None, float]:
-        """Write what is due; give when more is, None for never, and for how long bytes have waited, seconds."""
+        """Write what is due; return when more is due, None for never, and for how long bytes have waited, seconds."""
         session, link, outbox = self.session, self.link, self.session.outbox
         if link is None:
             return None, 0.0
@@ -276,7 +276,7 @@ class Conversation(Receiver):
 
     @property
     def blocker(self) -> str | None:
-        """Why the conversation cannot be handed to another process now; None where it can."""
+        """Why the conversation cannot be handed to another process now; None if it can."""
         link = self.link
         if link is None or self.session.over:
             return "the connection is not up"

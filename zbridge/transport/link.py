@@ -30,7 +30,7 @@ class Receiver:
         """Take a datagram from the peer."""
 
     def claims(self, datagram: bytes, port: int) -> bool:
-        """Tell whether a datagram from a port of the peer's host that is nobody's source yet is from the peer."""
+        """Return whether a datagram from a port of the peer's host that is nobody's source yet is from the peer."""
         return False
 
     def rivalled(self) -> None:

@@ -80,6 +80,7 @@ async def test_what_cannot_be_read_means_latched_until_that_is_released(folder: 
     (latch,) = (found := kept.load()).in_force
     assert latch.who == "gateway"
     assert "cannot be read" in (latch.reason or "")
+    assert not kept.known, "a gateway that waits tells the owner what it knows, not what it cannot read"
     found.release(latch.id, fleet=False)
     kept.save(found)
     await kept.flush()
@@ -136,19 +137,19 @@ async def test_a_gateway_that_waits_keeps_what_the_other_one_says_beside_the_fil
 async def test_that_the_robot_was_told_to_move_by_itself_is_kept_whoever_wrote_it_down(folder: Path) -> None:
     owner, waiting = store(folder), store(folder)
     assert not owner.load().autonomous
-    assert not owner.autonomous
+    assert not owner.known.autonomous
     waiting.mirror(LatchRecord(autonomous=True))
     waiting.mirror(LatchRecord((BOB,)))  # of a gateway that does not know of it
     await waiting.flush()
-    assert waiting.autonomous
+    assert waiting.known.autonomous
     taken = owner.load()
-    assert (taken.autonomous, owner.autonomous, taken.in_force) == (True, True, (BOB,))
+    assert (taken.autonomous, owner.known.autonomous, taken.in_force) == (True, True, (BOB,))
     taken.release(BOB.id, fleet=True)
     owner.save(taken)
     await owner.flush()
     again = store(folder)
     assert again.load().autonomous
-    assert again.autonomous
+    assert again.known.autonomous
 
 
 async def test_a_file_of_an_earlier_version_says_nothing_of_motion_by_itself(folder: Path) -> None:

@@ -485,15 +485,16 @@ async def test_a_waiting_gateway_hears_of_the_latches_and_releases_of_the_one_th
     assert not taking.done()
 
 
-async def test_the_gateway_that_serves_hears_from_one_that_waits_that_the_robot_was_told_to_move_by_itself() -> None:
-    bus, known = FakeBus("5"), [False]
+@pytest.mark.parametrize("known", [LatchRecord(autonomous=True), LatchRecord((Latch(b"a" * 16, "ann"),))])
+async def test_the_gateway_that_serves_hears_from_one_that_waits_what_that_one_knows(known: LatchRecord) -> None:
+    bus, records = FakeBus("5"), [LatchRecord(released=(b"b" * 16,), released_fleet=(b"c" * 16,))]
     robot, _ = watched(await owned(bus))
-    taking = asyncio.create_task(Ownership(bus.join("1"), KEYS, autonomous=lambda: known[0]).take())
+    taking = asyncio.create_task(Ownership(bus.join("1"), KEYS, record=lambda: records[-1]).take())
     await asyncio.sleep(1.0)
-    assert robot.merged == []
-    known[0] = True
+    assert robot.merged == [], "whoever asks may release nothing"
+    records.append(known)
     await asyncio.sleep(1.0)
-    assert {*robot.merged} == {LatchRecord(autonomous=True)}
+    assert {*robot.merged} == {known}
     assert not taking.done()
 
 
@@ -519,6 +520,25 @@ async def test_a_successor_is_no_rival_before_it_has_begun_and_its_claim_keeps_o
     second.begin()
     await asyncio.sleep(10.0)
     assert successor.turns == []
+
+
+async def test_who_waits_for_a_robot_does_not_take_it_while_a_successor_starts() -> None:
+    bus = FakeBus("5")
+    first = await owned(bus)
+    waiting = Ownership(bus.join("1"), KEYS)
+    taking = asyncio.create_task(waiting.take())
+    await asyncio.sleep(1.0)
+    first.release()
+    for _ in range(200):
+        await asyncio.sleep(0.01)
+        if await bus.alive(TOKEN):  # it announces its claim
+            break
+    waiting.hands_over = True
+    await asyncio.sleep(10.0)
+    assert not taking.done()
+    waiting.hands_over = False  # the successor has failed
+    await asyncio.sleep(2.0)
+    assert taking.done()
 
 
 async def test_the_successor_of_one_that_had_yielded_has_yielded() -> None:

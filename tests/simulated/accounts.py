@@ -111,7 +111,7 @@ class Grant:
             self.autonomous, self.last_mode = command.value > 0, command
             return
         if not command.value:
-            if late_s < 0.3:
+            if late_s < 0.3 or not command.dated:
                 self.needs_neutral = False
             self.last_motion, self.autonomous = None, False
             return

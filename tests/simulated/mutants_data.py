@@ -281,7 +281,7 @@ MUTANTS = (
         "nobody looks before taking",
         "ownership",
         OWNERSHIP,
-        "if self._bus.gone or await self._sees(others):",
+        "if self.hands_over or self._bus.gone or await self._sees(others):",
         "if False:",
     ),
     Mutant(

@@ -38,8 +38,9 @@ def _smaller(scenario: dict[str, Any]) -> Iterator[dict[str, Any]]:
         size //= 2
     for kind in ("programs", "gateways", "drivers"):
         for number in range(len(scenario.get(kind, [])) - 1, 0 if kind != "programs" else -1, -1):
-            rest = [each for place, each in enumerate(scenario[kind]) if place != number]
-            yield {**scenario, kind: rest}
+            name = scenario[kind][number]["name"]
+            rest = [each for each in scenario[kind] if each["name"] != name]
+            yield {**scenario, kind: rest, "steps": [step for step in steps if step.get("target") != name]}
     last = max([step["t"] for step in steps], default=2.0)
     if last + 3.0 < scenario["seconds"] - 1.0:
         yield {**scenario, "seconds": round(last + 3.0, 1)}

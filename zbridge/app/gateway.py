@@ -216,7 +216,7 @@ class Gateway:
         store.load()  # the gateway that serves the robot is sent its contents
         clock, chance = self._runtime.clock, self._runtime.chance
         ownership = Ownership(
-            bus, self._keys, clock, mirror=store.mirror, autonomous=lambda: store.autonomous, chance=chance
+            bus, self._keys, clock, mirror=store.mirror, record=lambda: store.known.record, chance=chance
         )
         incoming, state = self._incoming, self._incoming.state
         self.restarts.claim = claim = ClaimPart(ownership, store)

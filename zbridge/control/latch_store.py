@@ -53,6 +53,8 @@ class LatchStore:
         folder = folder if folder is not None else state_folder()
         self._own, self._standby = (folder / f"{keys.realm}@{keys.robot}.{kind}" for kind in (_OWN, _STANDBY))
         self._conditions = conditions
+        self.known = Latches()
+        """What could be read, and what the gateway that owns the robot said since; after :meth:`load`."""
         self._written: dict[Path, LatchRecord] = {}
         """What is on disk, or on its way there."""
         self._waiting: dict[Path, LatchRecord] = {}
@@ -63,6 +65,7 @@ class LatchStore:
 
     def load(self) -> Latches:
         """Read what is in force; from a file that cannot be read a latch without an end but its own release."""
+        self.known = Latches()
         record = self._read(self._own)
         latches = Latches(record)
         if record is not None:
@@ -79,19 +82,15 @@ class LatchStore:
         Returns what ends when everything is written, or could not be; None if nothing is to be written.
         """
         self._put(self._own, latches.record)
+        self.known = Latches(latches.record)
         if self._standby in self._written:  # it is in the own file now
             self._put(self._standby, LatchRecord())
         return self._writing
 
-    @property
-    def autonomous(self) -> bool:
-        """Whether any file says that the robot was ordered to move by itself; after :meth:`load`."""
-        return any(record.autonomous for record in self._written.values())
-
     def mirror(self, record: LatchRecord) -> None:
         """Write what the gateway that owns the robot says, on a thread."""
-        autonomous = record.autonomous or self._written.get(self._standby, LatchRecord()).autonomous
-        self._put(self._standby, msgspec.structs.replace(record, autonomous=autonomous))
+        self.known.merge(record)
+        self._put(self._standby, msgspec.structs.replace(record, autonomous=self.known.autonomous))
 
     async def flush(self) -> None:
         """Wait until everything is written, or could not be, for at most :data:`FLUSH_S`."""
@@ -107,13 +106,15 @@ class LatchStore:
                 data = file.read(MOST_BYTES + 1)
             if len(data) > MOST_BYTES:
                 raise ValueError(f"more than {MOST_BYTES} bytes")
-            return _decode(data)
+            record = _decode(data)
         except FileNotFoundError:
             return None
         except (OSError, ValueError, msgspec.MsgspecError) as error:
             reason = f"{path} cannot be read: {error}"
             log.error("%s: the robot is latched", reason)
             return LatchRecord((Latch(os.urandom(16), "gateway", reason),))
+        self.known.merge(record)
+        return record
 
     # Writing
 

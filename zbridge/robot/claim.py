@@ -89,11 +89,13 @@ class Claim(msgspec.Struct, frozen=True):
 class ClaimQuestion(msgspec.Struct, frozen=True):
     """A question for claims. zid: who asks, so that a gateway knows its own question; serves: whether it owns too.
 
-    autonomous: the sender knows that the robot was ordered to move by itself.
+    latches, autonomous: the latched stops that the sender knows, and whether the robot was ordered to move by itself.
+    Released ids are not here: whoever asks has not proved that it may release anything.
     """
 
     zid: str = ""
     serves: bool = False
+    latches: tuple[Latch, ...] = ()
     autonomous: bool = False
 
 

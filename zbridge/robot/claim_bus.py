@@ -27,8 +27,8 @@ _WHO = "gateway"
 class ClaimBus:
     """The claims of the gateways of one robot. chance: 0 to 1.
 
-    claim: returns the own claim. autonomous: whether this gateway knows that the robot was told to move by itself.
-    merge: is told what gateways that ask know.
+    claim: returns the own claim; record: what this gateway knows of the robot. merge: is told what gateways that ask
+    know.
     """
 
     def __init__(
@@ -38,7 +38,7 @@ class ClaimBus:
         chance: Callable[[], float],
         *,
         claim: Callable[[], Claim],
-        autonomous: Callable[[], bool],
+        record: Callable[[], LatchRecord],
         merge: Callable[[LatchRecord], None],
     ) -> None:
         self.was_asked = False
@@ -47,7 +47,7 @@ class ClaimBus:
         self._key, self._token = keys.key(CLAIM), keys.alive(_WHO)
         self._chance = chance
         self._claim = claim
-        self._autonomous = autonomous
+        self._record = record
         self._merge = merge
         self._claimed: list[Handle] = []
         self._shown: list[Handle] = []
@@ -91,8 +91,9 @@ class ClaimBus:
 
     async def claims(self) -> dict[str, Claim]:
         """Ask for the claims of others; see :func:`best_claims`."""
-        question = write(ClaimQuestion(self._bus.zid, self._claim().held_s > 0, self._autonomous()))
-        return best_claims(await self._bus.ask(self._key, question, timeout_s=ASK_S), self._bus.zid)
+        known = self._record()
+        question = ClaimQuestion(self._bus.zid, self._claim().held_s > 0, known.latches, known.autonomous)
+        return best_claims(await self._bus.ask(self._key, write(question), timeout_s=ASK_S), self._bus.zid)
 
     def outbid(self, own: Claim, claims: Mapping[str, Claim]) -> bool:
         """Return whether any of these claims is better than the own one."""
@@ -139,8 +140,8 @@ class ClaimBus:
             if asker.serves:
                 self._asked.set()
                 self.was_asked = True
-            if asker.autonomous:
-                self._merge(LatchRecord(autonomous=True))
+            if asker.latches or asker.autonomous:
+                self._merge(LatchRecord(asker.latches, autonomous=asker.autonomous))
         question.answer(write(self._claim()))
 
 

@@ -101,8 +101,8 @@ class OwnershipInput(StrEnum):
 class Ownership:
     """The right to be a robot's gateway, from :meth:`take` to :meth:`release` or the end of :meth:`watch`.
 
-    mirror: is told the latched stops of the gateway that owns the robot while this one does not. autonomous: whether
-    this gateway knows that the robot was told to move by itself. chance: 0 to 1.
+    mirror: is told the latched stops of the gateway that owns the robot while this one does not. record: what this
+    gateway knows of the robot. chance: 0 to 1.
     """
 
     def __init__(
@@ -112,10 +112,10 @@ class Ownership:
         clock: Callable[[], float] = time.monotonic,
         *,
         mirror: Callable[[LatchRecord], object] = lambda record: None,
-        autonomous: Callable[[], bool] = lambda: False,
+        record: Callable[[], LatchRecord] = LatchRecord,
         chance: Callable[[], float] = random.random,
     ) -> None:
-        self._bus = ClaimBus(bus, keys, chance, claim=self._claim, autonomous=autonomous, merge=self._merge)
+        self._bus = ClaimBus(bus, keys, chance, claim=self._claim, record=record, merge=self._merge)
         self._robot = keys.robot
         self._clock = clock
         self._mirror = mirror
@@ -141,21 +141,20 @@ class Ownership:
     async def take(self) -> None:
         """Wait until no other gateway claims the robot, then own it.
 
-        While a bus that was connected is not, no gateway can be seen, so nothing is taken.
+        While a bus that was connected is not, no gateway can be seen, so nothing is taken. Nor is anything while
+        a successor is handed over to: it has been told that there is no robot to continue.
         """
         await self._bus.settle()
         others, self._looks = OtherGateways(self._robot), 1
         while True:
-            if self._bus.gone or await self._sees(others):
+            if self.hands_over or self._bus.gone or await self._sees(others):
                 found = OwnershipInput.SEEN
             else:
                 found = OwnershipInput.CLEAR if self._looks > 1 else OwnershipInput.LAST_CLEAR
             if self._handle(found) is OwnershipState.CLAIMING:
                 await asyncio.sleep(ANNOUNCE_S)
-                own = self._claim()
-                found = (
-                    OwnershipInput.OUTBID if self._bus.outbid(own, await self._bus.claims()) else OwnershipInput.BEST
-                )
+                outbid = self._bus.outbid(self._claim(), await self._bus.claims())
+                found = OwnershipInput.OUTBID if outbid or self.hands_over else OwnershipInput.BEST
                 if self._handle(found) is OwnershipState.OWNING:
                     self._close_until = others.close_until(self._clock())
                     return

@@ -50,6 +50,8 @@ class Checker:
         self.current: dict[str, Grant] = {}
         """By gateway, the lease that it granted last."""
         self.latches: dict[str, dict[bytes, float]] = {each.name: {} for each in simulation.gateways}
+        self._released_at: dict[bytes, float] = {}
+        """By latched stop, when a gateway released it."""
         self.uncertain: set[bytes] = set()
         """Latched stops of which a gateway may know and another one not: it was killed, or has not taken over."""
         self._unlatched: defaultdict[bytes, set[str]] = defaultdict(set)
@@ -128,6 +130,7 @@ class Checker:
         if verb.startswith("unlatch"):
             stop_id = request.get("id", b"")
             self._unlatched[stop_id].add(gateway)
+            self._released_at.setdefault(stop_id, self.world.now)
             for name, known in self.latches.items():
                 if known.pop(stop_id, None) is not None and name != gateway:
                     self.uncertain.add(stop_id)  # that gateway has still to learn of it
@@ -232,6 +235,8 @@ class Checker:
                     asked = self._met_for(one, other) > MEET_S and self.world.now - self._mode_at > LOOK_S
                     if asked and self.know_mode & pair:
                         self.know_mode |= pair
+                    if self._met_for(one, other) > MEET_S:
+                        self._share_releases(pair)
                 else:
                     self._met.pop(pair, None)
 
@@ -244,6 +249,12 @@ class Checker:
             for stop_id, at in self.latches[here].items():
                 if now - at > KNOWN_S:
                     self.latches[there].setdefault(stop_id, now)
+
+    def _share_releases(self, pair: frozenset[str]) -> None:
+        """Two gateways of one robot that met since a latched stop was released both know that."""
+        for stop_id, names in self._unlatched.items():
+            if names & pair and self.world.now - self._released_at[stop_id] > MEET_S:
+                self.uncertain.discard(stop_id)
 
     def _met_for(self, one: str, other: str) -> float:
         return self.world.now - self._met.get(frozenset((one, other)), self.world.now)
@@ -270,6 +281,8 @@ class Checker:
         now = self.world.now
         for program in self.simulation.programs:
             most_s = HQ_DEADMAN_S[program.protocol] + 0.35
+            if program.options.get("once") and self.released.holds(program, command.value, most_s):
+                return
             later: float | None = None  # of two wheels one may have the next value
             for at, value in reversed(self._gives[program.name]):
                 if now - at > most_s:
@@ -281,7 +294,14 @@ class Checker:
                     if program.protocol == "tcpudp":  # one value a command
                         self.released.put_late(listener, program.name, at, list(self._gives[program.name]))
                     return
+        if self.released.waited(command.value, self._gives):
+            self.counts["excused: pushed during a cut, from the centre"] += 1
+            return
         self.violate("hq-motion", f"{listener} put {command}, which no HQ program said lately")
+
+    def wrote_motion_at(self, gateway: str) -> float:
+        """Return when a gateway wrote motion last."""
+        return self._wrote_motion.get(gateway, -1.0)
 
     def said_last(self, program: str) -> float:
         """Return what a program said last, 0 for neutral."""

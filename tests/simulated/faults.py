@@ -160,6 +160,12 @@ class Faults:
         self._simulation.fabric.follow()
         self._later(step, lambda: self._simulation.paths.heal(here, there))
 
+    def _mute(self, step: dict[str, Any]) -> None:
+        """Let the robot send a gateway nothing more."""
+        robot, host = self._simulation.robot, self._simulation.members[step["target"]].host.name
+        robot.mute_to.add(host)
+        self._later(step, lambda: robot.mute_to.discard(host))
+
     def _reset(self, step: dict[str, Any]) -> None:
         """Reset the connections between two hosts."""
         pair = set(step["between"])
@@ -281,6 +287,7 @@ class Faults:
             paths.heal(here, there)
         paths.loss = paths.duplicates = fabric.duplicates = fabric.news_late_s = fabric.news_lost = 0.0
         paths.slow.clear()
+        simulation.robot.mute_to.clear()
         processes = [simulation.robot, *simulation.programs]
         processes += [member.process for member in simulation.members.values() if member.alive]
         parts = [gateway.part(which) for gateway in simulation.gateways for which in "+-"]

@@ -90,9 +90,10 @@ class HqProgram(Process):
     def repeat(self, connection: int) -> None:
         """Say it again."""
         if self.end is not None and self.ready and connection == self._connection:
-            if self.value_now:
+            if self.value_now and not self.options.get("once"):
                 self.value_now = self.value()
-            self.say(self.value_now)
+            if not self.options.get("once"):
+                self.say(self.value_now)
             self.after(self.every_s, lambda: self.repeat(connection))
 
     def value(self) -> float:
@@ -230,7 +231,7 @@ class AlfHq(HqProgram):
 
     def send_motion(self, value: float) -> None:
         if self.end is not None:
-            self.end.send(b"3|%d|0|0|0;" % round(value * 255))
+            self.end.send(b"3|%d|0|%d|0;" % (round(value * 255), 0 if value else self.options.get("deflected", 0)))
 
 
 class WebotsHq(HqProgram):

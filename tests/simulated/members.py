@@ -24,6 +24,15 @@ ROBOT = "r1"
 _NOTHING = object()
 GARBLED_STOP = msgpack.packb({"id": bytes(16)}).replace(b"\x81", b"\x82") + b"\xa3who\xa2J\xf6"
 """A stop whose text is Latin-1: whoever sends it must be heard."""
+WAYS = {
+    "forward": ("forward", 1.0),
+    "back": ("forward", -1.0),
+    "left": ("left", 1.0),
+    "right": ("left", -1.0),
+    "turn left": ("turn", 1.0),
+    "turn right": ("turn", -1.0),
+}
+"""Fields of a drive, and their signs."""
 RESTART_S = 10.0
 """Longest wait for the answer to a restart."""
 
@@ -257,7 +266,7 @@ class DriverMember(Member):
                 if not step.get("silent") and loop.time() >= begins_at:
                     value = 0.0 if self._wiggles(step) else self.value()
                     self.note("gives", value)
-                    await (drive.motor(step["motor"], value * WHEEL_FULL) if "motor" in step else drive(forward=value))
+                    await self._command(drive, step, value)
             except NeutralFirst:
                 self.note("gives", 0.0)
                 await drive.neutral()
@@ -276,6 +285,13 @@ class DriverMember(Member):
             self.note("gives", 0.0)
             await drive()
             await asyncio.sleep(step.get("holds", 0.0))
+
+    async def _command(self, drive: Any, step: dict[str, Any], value: float) -> None:
+        way, sign = WAYS[step.get("way", "forward")]
+        if "motor" in step:
+            await drive.motor(step["motor"], sign * value * WHEEL_FULL)
+        else:
+            await drive(**{way: sign * value})
 
     # A client of its own, as docs/keys.md describes it: no liveliness token, and dates only where asked to
 
@@ -305,7 +321,8 @@ class DriverMember(Member):
             value = 0.0 if over or self._wiggles(step) else self.value()
             self.note("gives", value)
             number += 1
-            payload = msgpack.packb({"forward": value, "left": 0.0, "turn": 0.0})
+            way, sign = WAYS[step.get("way", "forward")]
+            payload = msgpack.packb({"forward": 0.0, "left": 0.0, "turn": 0.0, way: sign * value})
             key = f"fleet/{ROBOT}/@cmd/drive"
             shown = self._proof(lease, number, key, payload, dated)
             if not (over and not step.get("neutral", True)):

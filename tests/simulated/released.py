@@ -12,6 +12,7 @@ from tests.simulated.accounts import Grant
 
 if TYPE_CHECKING:
     from tests.simulated.checker import Checker
+    from tests.simulated.hq_programs import HqProgram
 
 UNUSED_S = 1.0
 """Longest time after ``lease_s`` of neutral until an HQ program's lease is given back."""
@@ -25,6 +26,10 @@ ORDER_S = 0.1
 """What a program says so long after something else arrives after it, by stream and by datagram."""
 AWAY_S = 0.8
 """A robot whose gateways were all killed so long ago is away for listeners that the bus reaches."""
+CLOSE = 0.0052
+"""By how much motion may differ from what the program gave."""
+AT_ONCE_S = 3.0
+"""Longest time after a cut until all that waited has arrived."""
 ALONE_S = 9.0
 """Longest time until the only gateway that runs serves the robot."""
 
@@ -55,6 +60,10 @@ class Released:
         """By program, when what it sends to its listener was cut off."""
         self._silent: dict[str, float] = {}
         """By program, when its network was back after a silence in which it pushed."""
+        self._centred: dict[str, float] = {}
+        """By program, when what it sends was cut off while its stick was centred."""
+        self._waited: dict[str, tuple[float, float]] = {}
+        """By program, such a cut's begin and end."""
         self._frozen: dict[str, float] = {}
         """By program, when its listener ran again after a freeze in which the program pushed."""
 
@@ -91,12 +100,29 @@ class Released:
             way, name = (program.host.name, program.address[0]), program.name
             if what == "cut" and (fields[:2] == way or (fields[2] and fields[:2] == way[::-1])):
                 self._silent.pop(name, None)
-                if self._checker.said_last(name):
-                    self._cut_at[name] = self._world.now
+                pushes = self._checker.said_last(name)
+                (self._cut_at if pushes else self._centred).setdefault(name, self._world.now)
+            elif what == "healed" and set(fields) == set(way) and name in self._centred:
+                self._waited[name] = (self._centred.pop(name), self._world.now)
             elif what == "healed" and set(fields) == set(way) and name in self._cut_at:
                 silent_s = self._world.now - self._cut_at.pop(name)
                 if silent_s > SILENT_S and self._checker.said_last(name):
                     self._silent[name] = self._world.now
+
+    def holds(self, program: HqProgram, motion: float, most_s: float) -> bool:
+        """Whether a program that sets a velocity once set this one last, and its machine is connected (``hold``)."""
+        cut_s = self._world.now - self._cut_at.get(program.name, self._world.now)
+        close = abs(self._checker.said_last(program.name) - motion) < CLOSE
+        return close and program.end is not None and cut_s < most_s
+
+    def waited(self, motion: float, gives: Mapping[str, Iterable[tuple[float, float]]]) -> bool:
+        """Whether a program gave this motion while a cut held it up that found its stick centred: docs/hq.md."""
+        for program, (cut_at, healed_at) in self._waited.items():
+            if self._world.now - healed_at < AT_ONCE_S and any(
+                cut_at < at < healed_at + ORDER_S and abs(value - motion) < CLOSE for at, value in gives[program]
+            ):
+                return True
+        return False
 
     def granted(self, grant: Grant, taken_at: float | None, gives: Mapping[str, Iterable[tuple[float, float]]]) -> None:
         """An HQ program whose robot was taken says neutral before it drives again."""
@@ -189,6 +215,8 @@ class Released:
     def _look_for_unused(self) -> None:
         grant, now = self._of_program(), self._world.now
         if grant is None or self._only is None or self._mode.get(self._only) == 3:
+            return
+        if self._simulation.programs[0].options.get("once") and self._checker.said_last(self._only):
             return
         used_at = max(self._spoke_at.get(self._only, 0.0), grant.at)
         if now - used_at > grant.lease_s + UNUSED_S and self._judges(grant, used_at):

@@ -41,6 +41,8 @@ class SimRobot(Process):
         self.lossless = False
         self.splits_s: float = options.get("splits_s", 0.0)
         """Seconds between the two parts in which telemetry leaves; 0: it leaves whole."""
+        self.mute_to: set[str] = set()
+        """Hosts that it sends nothing more to."""
         self._rests: dict[End, bytes] = {}
         self.told = 0
         """Telemetry messages that were sent, each with its number."""
@@ -74,7 +76,8 @@ class SimRobot(Process):
     def report(self, end: End) -> None:
         """Send telemetry, again and again."""
         if end in self.ends and not end.closed:
-            self.tell(end)
+            if end.peer.address[0] not in self.mute_to:
+                self.tell(end)
             self.after(self.telemetry_s, lambda: self.report(end))
 
     def tell(self, end: End) -> None:

@@ -103,7 +103,7 @@ class Simulation:
             {
                 "protocol": protocol,
                 "listen": f"tcp://{given['host']}:{HQ_PORT + number}",
-                "options": HQ_OPTIONS[protocol],
+                "options": {"hold": given.get("hold", False)} if protocol == "wc2ec" else {},
             }
             for number, protocol in enumerate(given.get("hq", []))
         ]
@@ -153,9 +153,6 @@ class Simulation:
         outcome.hash, outcome.seconds = world.trace_hash, world.now
         outcome.counts, outcome.lines = self.checker.counts, world.lines or []
         return outcome
-
-
-HQ_OPTIONS: dict[str, dict[str, Any]] = {"tcpudp": {}, "alf": {}, "wc2ec": {"hold": False}}
 
 
 def run(scenario: dict[str, Any], *, keep_trace: bool = False) -> Outcome:

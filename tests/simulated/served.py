@@ -55,11 +55,16 @@ class ServedRules:
             return None
         if robot.paused or robot.crashed or robot.used_up or fabric.news_lost or fabric.news_late_s or paths.slow:
             return None
-        up = {each.name: paths.up("robot", each.host.name) and paths.up(each.host.name, "robot") for each in serving}
+        up = {each.name: self._hears_robot(each.host.name) for each in serving}
         connected = {self._checker.by_host.get(end.peer.address[0]) for end in robot.ends if not end.peer.broken}
         reaching = [name for name, way in up.items() if way and name in connected]
         cut_off = [name for name, way in up.items() if not way]
         return reaching[0] if len(reaching) == len(cut_off) == 1 else None
+
+    def _hears_robot(self, host: str) -> bool:
+        paths = self._simulation.paths
+        works = paths.up("robot", host) and paths.up(host, "robot")
+        return works and host not in self._simulation.robot.mute_to
 
 
 def _sessions(gateways: list[Any]) -> list[Any]:

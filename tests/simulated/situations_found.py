@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable
 
-from tests.simulated.steps import WHEELS, Made, drive, fault, split, stick, tcpudp
+from tests.simulated.steps import WHEELS, Made, drive, fault, second_gateway, split, stick, tcpudp
 
 
 def _client(made: Made) -> None:
@@ -70,9 +70,10 @@ def _moves_an_arm(rng: random.Random, made: Made) -> None:
     """A program moves a motor that is none of the wheels, and says nothing more."""
     _client(made)
     made["robot"] = {"protocol": "wc2ec", "options": {"arm": True}, "device": WHEELS}
-    ends = rng.choice(("kill", "pause", ""))
+    ends = rng.choice(("kill", "pause", "pause"))
     t = rng.uniform(4.0, 6.0)
-    made["steps"] = [drive(3.0, "op1", motor="arm", neutral=False) | {"for": t - 3.0 + (2.0 if ends else 0.0)}]
+    motor = {"motor": "arm", "way": rng.choice(("forward", "back", "back"))}
+    made["steps"] = [drive(3.0, "op1", **motor, neutral=False) | {"for": t - 3.0 + (2.0 if ends else 0.0)}]
     if ends:
         made["steps"].append(fault(t, ends, target="op1") | {"for": 4.0})
 
@@ -239,6 +240,103 @@ def _latched_and_owner_gone(rng: random.Random, made: Made) -> None:
     made["steps"] += [drive(t + after, who) for after in (6.0, 9.0) for who in ("op1", "op2")]
 
 
+def _backwards(rng: random.Random, made: Made) -> None:
+    """A program drives backwards, sideways or turns, and is killed, or says nothing more while it holds the lease."""
+    made["drivers"][0] |= {"options": {"client": False, "dated": rng.random() < 0.5}, "router": "router1"}
+    ways = ("back", "left", "right", "turn left", "turn right")
+    way = "back" if made["robot"]["protocol"] == "wc2ec" else rng.choice(ways)
+    if made["robot"]["protocol"] == "alf":
+        tcpudp(rng, made)
+    t = rng.uniform(4.0, 5.0)
+    ends = rng.choice(("kill", "pause", ""))
+    made["steps"] = [
+        drive(3.0, "op1", way=way, neutral=False, releases=False) | {"for": t - 3.0 + (2.0 if ends else 0.0)},
+        drive(t + 2.5, "op2", way=way, takeover=True) | {"for": 1.0},
+    ]
+    if ends:
+        made["steps"].append(fault(t, ends, target="op1") | {"for": 4.0})
+
+
+def _late_and_silent(rng: random.Random, made: Made) -> None:
+    """What a program that dates said last comes late, and it says nothing more: its deadman counts from its clock."""
+    made["drivers"][0] |= {"options": {"client": False, "dated": True}, "router": "router1"}
+    made["network"] = {"delay_s": 0.0005, "jitter_s": 0.0005}
+    t = rng.uniform(4.0, 5.0)
+    last = drive(3.0, "op1", hz=20.0, deadman_s=0.5, neutral=False, releases=False) | {"for": t - 3.0}
+    made["steps"] = [last]
+    made["steps"].append(fault(t - 0.3, "slow", between=["pc1", "router1"], by=rng.uniform(0.2, 0.3)) | {"for": 3.0})
+
+
+def _frozen_program(rng: random.Random, made: Made) -> None:
+    """An HQ program is frozen while it pushes; its machine still acknowledges."""
+    gateway = stick(rng, made, alone=rng.random() < 0.5)
+    if rng.random() < 0.5:
+        gateway["hq"], made["programs"][0]["protocol"] = ["wc2ec"], "wc2ec"
+    freeze = fault(rng.uniform(4.5, 6.0), "pause", target="stick1") | {"for": rng.uniform(2.0, 4.0)}
+    made["steps"] = [drive(3.5, "stick1") | {"for": 6.0}, freeze]
+
+
+def _controller_that_computes(rng: random.Random, made: Made) -> None:
+    """An external controller sets velocities once, and computes (``hold``); it is frozen, cut off or disconnects."""
+    gateway = stick(rng, made, alone=rng.random() < 0.5)
+    gateway["hq"], gateway["hold"] = ["wc2ec"], True
+    made["programs"][0] |= {"protocol": "wc2ec", "options": {"once": True}}
+    t = rng.uniform(5.0, 6.0)
+    ends = rng.choice(("cut", "leave", "pause", ""))
+    made["steps"] = [drive(3.5, "stick1") | {"for": rng.uniform(1.5, 4.0)}]
+    if ends == "cut":
+        cut = fault(t, "cut", between=["desk1", gateway["host"]]) | {"for": rng.uniform(2.0, 5.0)}
+        made["steps"].append(cut)
+    elif ends == "leave":
+        made["steps"].append({"t": t, "who": "stick1", "do": "leave"})
+    elif ends:
+        made["steps"].append(fault(t, ends, target=gateway["name"]) | {"for": rng.uniform(0.3, 2.0)})
+
+
+def _wheels_deflected_at_rest(rng: random.Random, made: Made) -> None:
+    """An HQ program of ALF rests with its wheels deflected, which turns no robot of another protocol."""
+    if made["robot"]["protocol"] == "alf":
+        tcpudp(rng, made)
+    gateway = stick(rng, made, alone=rng.random() < 0.5)
+    gateway["hq"] = ["alf"]
+    made["programs"][0] |= {"protocol": "alf", "options": {"deflected": rng.choice((-60, 45))}}
+    made["steps"] = [drive(3.5, "stick1") | {"for": rng.uniform(0.5, 3.0)}]
+    made["steps"].append(drive(9.0, "stick1") | {"for": rng.uniform(0.5, 3.0)})
+
+
+def _waits_and_learns(rng: random.Random, made: Made) -> None:
+    """A robot drives itself when its gateway is killed, and the one that waits, which was asked of it, serves it."""
+    tcpudp(rng, made)
+    made["robot"]["options"].pop("self_stop_s", None)
+    second_gateway(made)
+    _client(made)
+    choice = drive(4.0, "op1", mode="autonomous", silent=True, then=None) | {"for": 9.0}
+    kill = fault(3.9, "kill", target="owner", when="mode read", after=round(rng.uniform(1.0, 2.5), 3))
+    made["steps"] = [choice, kill | {"for": 12.0}]
+
+
+def _killed_before_the_disk(rng: random.Random, made: Made) -> None:
+    """A gateway whose disk is slow is killed about when its robot is told to drive itself, and starts again."""
+    tcpudp(rng, made)
+    made["robot"]["options"] |= {"lossless": True}
+    made["robot"]["options"].pop("self_stop_s", None)
+    _client(made)
+    slow = fault(3.5, "threads", target="gw1", by=0.4) | {"for": 3.0}
+    choice = drive(4.0, "op1", mode="autonomous", silent=True, then=None) | {"for": 9.0}
+    kill = fault(3.9, "kill", target="gw1", when="mode read", after=round(rng.uniform(0.005, 0.2), 3))
+    made["steps"] = [slow, choice, kill | {"for": rng.uniform(0.2, 2.0)}]
+
+
+def _silent_to_the_owner(rng: random.Random, made: Made) -> None:
+    """Two gateways serve the robot, and meet; then the robot sends the owner nothing more, and still hears it."""
+    tcpudp(rng, made)
+    made["robot"]["options"]["udp"] = False
+    steps = split(rng, made, t=3.5, s=rng.uniform(9.0, 11.0))
+    t = 3.5 + steps[0]["for"] + rng.uniform(5.0, 6.0)
+    mute = fault(t, "mute", target="owner") | {"for": rng.uniform(12.0, 16.0)}
+    made["steps"] = [*steps, mute, *(drive(t + rng.uniform(8.0, 9.0), who) for who in ("op1", "op2"))]
+
+
 FOUND: tuple[Callable[[random.Random, Made], None], ...] = (
     _cut_when_granted,
     _cut_when_granted,
@@ -263,4 +361,12 @@ FOUND: tuple[Callable[[random.Random, Made], None], ...] = (
     _garbled_stop,
     _yielded_without_bus,
     _latched_and_owner_gone,
+    _backwards,
+    _late_and_silent,
+    _frozen_program,
+    _controller_that_computes,
+    _wheels_deflected_at_rest,
+    _waits_and_learns,
+    _killed_before_the_disk,
+    _silent_to_the_owner,
 )

@@ -10,7 +10,7 @@ import math
 from collections import defaultdict
 from typing import TYPE_CHECKING, Any
 
-from tests.simulated.accounts import read
+from tests.simulated.accounts import Command, read
 from tests.simulated.written import stops
 
 if TYPE_CHECKING:
@@ -22,6 +22,8 @@ LATE_S = 1.2
 """How much later a stop may be: stops that follow a neutral, and those that a link or a full buffer holds up."""
 ASKED_S = 5.0
 """Longest time that a program takes to confirm a stop."""
+DEADMAN_LATE_S = 0.12
+"""How much later than its deadman a robot is stopped: what a dated command was late by counts."""
 SILENCE_S = 2.5
 """Seconds after packet 4 in which a TCP/UDP robot gets nothing but a packet 7."""
 SHOWN_S = 1.0
@@ -41,6 +43,8 @@ class StopRules:
         self._received: set[bytes] = set()
         self._stopped_at: dict[str, float] = {}
         """By gateway, when it wrote a stop last."""
+        self._moved: dict[str, Command] = {}
+        """By gateway, the motion that it received last."""
         self._works: tuple[str | None, float] = (None, 0.0)
         self._starts: dict[str, float] = {}
         """By gateway, when the robot asked it for datagrams."""
@@ -55,6 +59,8 @@ class StopRules:
                 self._put[who].setdefault(stop_id, self._world.now)
             elif isinstance(stop_id, bytes) and who.rstrip("+-") in self._checker.gateways:
                 self._received.add(stop_id)
+        elif what == "receives" and who in self._checker.gateways:
+            self._on_command(who)
         elif what == "done" and fields[0] in ("stop", "latch"):
             self._on_done(who, fields[0])
         elif what == "puts" and who in self._checker.gateways and fields[0].endswith("/status"):
@@ -90,8 +96,33 @@ class StopRules:
         if stops(self._checker.protocol, data):
             self._stopped_at[gateway] = self._world.now
 
+    def _on_command(self, gateway: str) -> None:
+        grant = self._checker.current.get(gateway)
+        if grant is not None and grant.last_motion is not None:
+            self._moved[gateway] = grant.last_motion
+
+    def _look_for_the_deadman(self) -> None:
+        """A robot whose driver says nothing more is stopped after its deadman, which counts from when it spoke."""
+        for gateway, command in tuple(self._moved.items()):
+            grant, received = self._checker.current.get(gateway), command.received[gateway]
+            if grant is None or grant.last_motion is not command or grant.ended_at is not None:
+                del self._moved[gateway]
+                continue
+            given_at = command.given_at + grant.base_s if command.dated else received
+            late_s = self._world.now - given_at - grant.deadman_s
+            if late_s < DEADMAN_LATE_S:
+                continue
+            del self._moved[gateway]
+            steady = self._works[0] == gateway == self._checker.obligations.works() and self._works[1] < received - 1.0
+            ran = self._checker.obligations.undisturbed(gateway, received - 1.0)
+            moves = self._checker.wrote_motion_at(gateway) >= received
+            self._checker.counts["deadman judged"] += steady and ran and moves
+            if steady and ran and moves and self._stopped_at.get(gateway, 0.0) < received:
+                self._checker.violate("deadman", f"{gateway} did not stop the robot {late_s:.2f} s after the deadman")
+
     def tick(self) -> None:
         """Look for a robot that nobody drives, and that is sent no stop."""
+        self._look_for_the_deadman()
         now, checker = self._world.now, self._checker
         gateway = checker.obligations.works()
         if gateway != self._works[0]:

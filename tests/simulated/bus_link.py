@@ -101,7 +101,8 @@ class Link:
         self._number = 0
         self._life = 0
         self._stays_down = False
-        self._locked = False
+        self.locked = False
+        """Whether the session makes no connection any more, until its process opens another one."""
         self._blocked_until = 0.0
         """The old connection is closed only then: TCP has to send that again, too."""
         self._ways = self._new_ways()
@@ -293,7 +294,7 @@ class Link:
 
     def lock(self) -> None:
         """End the link for good, as eclipse-zenoh/zenoh#1876 does: only another session helps."""
-        self._locked = True
+        self.locked = True
         self.drop(stays=True)
 
     def _end(self, end: int) -> None:
@@ -346,8 +347,8 @@ class Link:
 
     def restore(self) -> None:
         """Make the link anew, if the paths allow it."""
-        self._stays_down = self._locked
-        if self._locked or self.ends[0] or not self._flows or not self.fabric.routers[self.hosts[1]].up:
+        self._stays_down = self.locked
+        if self.locked or self.ends[0] or not self._flows or not self.fabric.routers[self.hosts[1]].up:
             return
         self._end(1)
         self._life += 1

@@ -124,8 +124,9 @@ class Obligations:
     def _ended_unexplained(self, grant: Grant) -> None:
         """A lease whose holder drives does not end for no reason: one gateway, and nothing that ended it."""
         alone = sum(each.serves for each in self.simulation.gateways) == 1
+        locked = self.checker.gateways[grant.gateway].session.link.locked  # it leaves the bus, and joins it anew
         driven = grant.last_motion is not None and self.world.now - grant.last_motion.put_at < 0.5
-        if grant.ended_at is None and alone and driven and self.undisturbed(grant.gateway, grant.at):
+        if grant.ended_at is None and alone and driven and not locked and self.undisturbed(grant.gateway, grant.at):
             self.checker.violate("lost-lease", f"{grant} ended for no reason while it was used")
 
     def undisturbed(self, who: str, since: float) -> bool:

@@ -209,9 +209,12 @@ class RestartRules:
                 self.checker.violate("restart-hq", f"nobody serves {program.name} long after all faults are over")
 
 
+AUTONOMOUS = 3.0
+
+
 def _motion(protocol: str, data: bytes) -> bool | None:
     """Tell whether a frame moves the robot (True), or stops it (False); None: neither."""
-    if motions(protocol, data):
+    if any(kind == "motion" or value == AUTONOMOUS for kind, value in motions(protocol, data)):
         return True
     if protocol == "tcpudp" and len(data) >= 6:
         return False if data[5] in (11, 12, 13) else None

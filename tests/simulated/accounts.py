@@ -13,6 +13,8 @@ TOLERANCE = {"tcpudp": 1e-6, "alf": 0.0051, "wc2ec": 1e-6}
 """By how much a value at the robot may differ from the one that was given, fractions of full scale."""
 MAX_AGE_S = 0.4
 """Seconds after which a dated command is stale, unless the deadman is less."""
+CLOSE_S = 0.05
+"""By how much the age of a command may be misjudged."""
 SLACK_S = 0.06
 """What is on its way through a gateway when a lease ends may be written so long."""
 WHEEL_FULL = 10.0
@@ -32,6 +34,8 @@ class Command:
         self.number = shown.get("seq", 0)
         self.called_off: float | None = None
         """When its sender said neutral, or chose another mode; of a mode."""
+        self.perhaps_stale = False
+        """Whether its age is so near the limit that it may have been refused."""
         self.dated = "t" in shown
         self.received: dict[str, float] = {}
         """By gateway."""
@@ -73,6 +77,8 @@ class Grant:
         self.last_motion: Command | None = None
         self.last_mode: Command | None = None
         self.needs_neutral = False
+        self._newest = 0
+        """The highest number of its commands that arrived."""
         self.used = False
         """Whether anything was sent with it."""
 
@@ -104,6 +110,9 @@ class Grant:
         late_s -= self.base_s
         if not command.dated or late_s < MAX_AGE_S + 0.1:
             self.renewed_at = now
+        if command.number < self._newest:
+            return  # refused as out of order
+        self._newest = command.number
         mode = self.last_mode
         if mode is not None and mode.called_off is None and not command.value and command.number > mode.number:
             mode.called_off = now
@@ -115,10 +124,12 @@ class Grant:
                 self.needs_neutral = False
             self.last_motion, self.autonomous = None, False
             return
-        if command.dated and late_s > min(MAX_AGE_S, self.deadman_s) + 0.05:
+        most_s = min(MAX_AGE_S, self.deadman_s)
+        if command.dated and late_s > most_s + CLOSE_S:
             return  # refused as stale for certain: it begins nothing
+        command.perhaps_stale = command.dated and late_s > most_s - CLOSE_S
         last = self.last_motion
-        if last is not None:
+        if last is not None and not last.perhaps_stale:
             since_s = now - (last.given_at if last.dated else last.received[self.gateway])
             if since_s > self.deadman_s + self.base_s + 0.1:
                 self.needs_neutral = True
@@ -142,7 +153,7 @@ def fault_of(command: Command, grant: Grant | None, gateway: str, now: float) ->
     if command.forbidden:
         return "neutral-first", "after the deadman, without a neutral"
     late_s = received - command.given_at - grant.base_s
-    if command.dated and late_s > min(MAX_AGE_S, grant.deadman_s) + 0.05:
+    if command.dated and late_s > min(MAX_AGE_S, grant.deadman_s) + CLOSE_S:
         return "stale", f"it came {late_s:.2f} s late"
     if command.called_off is not None and now > command.called_off + SLACK_S:
         return "called-off", f"it was called off {now - command.called_off:.2f} s ago"

@@ -15,12 +15,12 @@ import numpy.typing as npt
 
 from gateways.alf import messages
 from gateways.alf.session import VehicleRole
-from gateways.alf.translate import FULL_LOCK_DEG, NAME, UNITS, Scale
+from gateways.alf.translate import FULL_LOCK_DEG, NAME, UNITS
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Motion, Motor, Scan, Scanner
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
-from zbridge.protocol import EncodeError, Exported, HqSide, Limits, Metrics, ProtocolError, Send, Telemetry
+from zbridge.protocol import EncodeError, Exported, HqSide, Limits, Metrics, Positive, ProtocolError, Send, Telemetry
 
 DEADMAN_S = 0.3
 """Legacy HQ programs repeat their command every 20 ms."""
@@ -42,8 +42,8 @@ class AlfHqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     dialect: Literal["text", "binary"] = "text"
     serve: Literal["auto", "drive", "laser", "both"] = "auto"
     points: Annotated[int, msgspec.Meta(ge=2, le=messages.MOST_POINTS)] = messages.POINTS
-    acceleration_m_s2: Scale | None = None
-    gyro_rad_s: Scale | None = None
+    acceleration_m_s2: Positive | None = None
+    gyro_rad_s: Positive | None = None
     gap_s: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.0
 
 

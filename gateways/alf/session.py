@@ -93,27 +93,16 @@ class AlfSession(Session[messages.AlfMessage]):
 
 
 class AlfHqRole(AlfSession):
-    """We play HQ towards a vehicle. ``drives``: the first command of a link that drives; it repeats from the start."""
+    """We play HQ towards a vehicle. ``at_first``: the command that a link that drives repeats from the start."""
 
     role = Role.HQ
+    at_first: messages.DriveCommand | None = None
     _SENT_BY_PEER = messages.sent_by(messages.AlfSender.VEHICLE)
-
-    def __init__(
-        self,
-        dialect: messages.AlfDialect,
-        *,
-        points: int = messages.POINTS,
-        points_from_scanner: bool = False,
-        gap_s: float = 0.0,
-        drives: messages.DriveCommand | None = None,
-    ) -> None:
-        super().__init__(dialect, points=points, points_from_scanner=points_from_scanner, gap_s=gap_s)
-        self._at_first = drives
 
     def opened(self, now: float) -> None:
         super().opened(now)
-        if self._at_first is not None:
-            self.drive(self._at_first, now)
+        if self.at_first is not None:
+            self.drive(self.at_first, now)
 
     def drive(self, command: messages.DriveCommand, now: float, *, urgent: bool = False) -> None:
         """Send a command at once, and again every 20 ms until the next one."""

@@ -48,6 +48,10 @@ class Packet(Message, frozen=True):
 
     spec: ClassVar[PacketSpec]
 
+    def raw(self) -> tuple[int, bytes]:
+        """Return the packet id and the body; raise EncodeError for values that do not fit."""
+        return self.spec.id, self.spec.codec.encode(self)
+
 
 P = TypeVar("P", bound=Packet)
 
@@ -264,6 +268,9 @@ class OpaquePacket(Packet, frozen=True):
     id: int
     body: bytes = b""
 
+    def raw(self) -> tuple[int, bytes]:
+        return self.id, self.body
+
 
 def frame_end(data: bytes, start: int) -> int:
     """Find where the packet at ``start`` ends ("Framing"): ``int32 length | u8 id | u8 packet id | body``."""
@@ -280,11 +287,8 @@ def encode_packet(message: Packet, sender_id: int, transport: str = "tcp") -> by
 
     Raise EncodeError for values that do not fit.
     """
-    carrier = Carrier.TCP
-    if isinstance(message, OpaquePacket):
-        packet_id, body = message.id, message.body
-    else:
-        packet_id, body, carrier = message.spec.id, message.spec.codec.encode(message), message.spec.carrier
+    packet_id, body = message.raw()
+    carrier = Carrier.TCP if isinstance(message, OpaquePacket) else message.spec.carrier
     try:
         frame = HEADER.pack(2 + len(body), sender_id, packet_id) + body
         return Datagram(frame) if transport == "udp" and carrier is Carrier.UDP_IF_AGREED else frame

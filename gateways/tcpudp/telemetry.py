@@ -76,18 +76,8 @@ class TelemetryTranslator(Kept):
     # Packets
 
     def _pose(self, message: packets.ServerPosition, stamp_ns: int) -> tuple[Telemetry, ...]:
-        unit_m = self._unit_m
-        return (
-            (
-                topics.POSE,
-                Pose(
-                    message.x * unit_m,
-                    message.y * unit_m,
-                    message.heading_deg * _RADIANS + self._heading_offset,
-                    stamp_ns=stamp_ns,
-                ),
-            ),
-        )
+        x, y, heading = message.x * self._unit_m, message.y * self._unit_m, message.heading_deg * _RADIANS
+        return ((topics.POSE, Pose(x, y, heading + self._heading_offset, stamp_ns=stamp_ns)),)
 
     def _map(self, message: packets.ServerSLAMMap, stamp_ns: int) -> tuple[Telemetry, ...]:
         """Turn x-major cells (index = x * side + y) into rows of y; cells other than 0, 1, 2 become unknown."""
@@ -137,11 +127,7 @@ class TelemetryTranslator(Kept):
 
     def _raw(self, message: packets.Packet, stamp_ns: int) -> tuple[Telemetry, ...]:
         """Pass on unchanged what no fleet message holds."""
-        if isinstance(message, packets.OpaquePacket):
-            raw = Raw(message.id, message.body, stamp_ns=stamp_ns)
-        else:
-            raw = Raw(message.spec.id, message.spec.codec.encode(message), stamp_ns=stamp_ns)
-        return ((topics.RAW(NAME), raw),)
+        return ((topics.RAW(NAME), Raw(*message.raw(), stamp_ns=stamp_ns)),)
 
 
 def announced_side(settings: Settings | None) -> int:

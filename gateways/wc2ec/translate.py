@@ -20,8 +20,6 @@ from gateways.wc2ec.devices import (
     RegisteredDevices,
     WebotsDevice,
     kind_of,
-    registered,
-    unnamed,
 )
 from gateways.wc2ec.options import Wc2EcOptions
 from gateways.wc2ec.session import ExternalRole
@@ -87,7 +85,7 @@ class Wc2EcRobot(RobotSide):
         self._table = RegisteredDevices()
         self._ring = self._new_ring()
         for option in self.options.devices if self._dialect is messages.Wc2EcDialect.DRAFT else ():
-            self._table.add(WebotsDevice(option.name, option.name, option.number, 0, option.kind))
+            self._table.add(WebotsDevice(option.name, option.number, 0, option.kind))
         return self.driving
 
     def _new_ring(self) -> BearingScan | None:
@@ -122,7 +120,7 @@ class Wc2EcRobot(RobotSide):
 
     def _registration(self, message: messages.RegisterSensor, stamp_ns: int) -> tuple[Telemetry, ...]:
         kind = kind_of(message.kind, self._motor_types)
-        device = registered(message.name, message.number, message.kind, kind)
+        device = WebotsDevice(message.name.decode("utf-8", "surrogateescape"), message.number, message.kind, kind)
         for motor, names in self._motor_names.items():
             if device.name in names:
                 device = msgspec.structs.replace(device, kind=motor)
@@ -140,7 +138,7 @@ class Wc2EcRobot(RobotSide):
         if device is None:
             self._unregistered.value += 1
             kind = LIGHT if self._dialect is messages.Wc2EcDialect.DRAFT else kind_of(message.kind, self._motor_types)
-            device = unnamed(message.number, message.kind, kind)
+            device = WebotsDevice(f"{kind}-{message.number}", message.number, message.kind, kind)
         options, name = self.options, device.name
         value = message.value
         low, high = options.bounds.get(name) or options.bounds_default or (-math.inf, math.inf)

@@ -12,17 +12,17 @@ from functools import partial
 from typing import Any, ClassVar
 
 from gateways.tcpudp import messages as packets
+from gateways.tcpudp.maps import known_cells
 from gateways.tcpudp.options import NAME, TcpUdpOptions
 from gateways.tcpudp.session.hq_role import HqRole
 from gateways.tcpudp.settings import RobotSettings13, Settings
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Cells, FleetMessage, Map, Pose, Raw, Switch, Text
+from zbridge.fleet.messages import FleetMessage, Map, Pose, Raw, Switch, Text
 from zbridge.protocol import Form, Kept, ProtocolError, Spare, Telemetry, Translate
 
 ON, OFF = 1, 2
 MAX_SIDE = 2048
 """Cells along a side of the largest map that is put together from parts."""
-_OCCUPIED = 2
 _RADIANS = math.pi / 180
 
 
@@ -88,7 +88,7 @@ class TelemetryTranslator(Kept):
         values = message.cells
         side = _side(len(values), settings)
         cell = self._cell_m(settings)
-        cells = _known_cells(np.frombuffer(values, np.uint8)).reshape(side, side).T
+        cells = known_cells(np.frombuffer(values, np.uint8)).reshape(side, side).T
         half = -side * cell / 2
         origin = self._options.map_origin or (half, half)
         return ((topics.MAP, Map(side, side, cell, origin, cells, stamp_ns=stamp_ns)),)
@@ -147,15 +147,6 @@ def _side(cells: int, settings: Settings | None) -> int:
     if side * side != cells:
         raise ProtocolError(f"map of {cells} cells is not square")
     return side
-
-
-def _known_cells(cells: Cells) -> Cells:
-    """Turn cells other than 0, 1, 2 into unknown."""
-    import numpy as np
-
-    if cells.size == 0 or np.maximum.reduce(cells) <= _OCCUPIED:
-        return cells
-    return np.where(cells <= _OCCUPIED, cells, np.uint8(0))
 
 
 def _switch(mode: int, stamp_ns: int) -> Switch:

@@ -17,7 +17,7 @@ from zbridge.wire.fields import Decimal, Field, Filling, Ints, Message, Scalar, 
 
 M = TypeVar("M", bound=Message)
 
-_NUMBER = re.compile(rb"-?[0-9]*\.?[0-9]+")
+NUMBER = re.compile(rb"-?[0-9]*\.?[0-9]+")
 _QUOTED = 24
 _DIGITS = b"0123456789"
 _UNCLIPPED = 2**63 - 2
@@ -43,7 +43,7 @@ class TextCodec(Generic[M]):
         if self._array is not None:
             values = self._with_array(body, self._array)
         else:
-            numbers = _NUMBER.findall(body)
+            numbers = NUMBER.findall(body)
             if len(numbers) != len(self._fields):
                 raise ProtocolError(f"{self._name} of {len(numbers)} fields, expected {len(self._fields)}")
             values = [self._read(field, number) for field, number in zip(self._fields, numbers, strict=True)]
@@ -183,7 +183,7 @@ def _integers(body: bytes) -> Ints:
 def _integers_one_by_one(body: bytes) -> Ints:
     import numpy as np
 
-    numbers = _NUMBER.findall(body)
+    numbers = NUMBER.findall(body)
     try:
         return np.array([int(number) for number in numbers], np.int64)
     except (ValueError, OverflowError) as error:

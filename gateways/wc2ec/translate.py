@@ -83,14 +83,11 @@ class Wc2EcRobot(RobotSide):
     def session(self, link: str, peer: str) -> ExternalRole:
         self.driving = ExternalRole(self._dialect)
         self._table = RegisteredDevices()
-        self._ring = self._new_ring()
+        bearings_deg = self.options.bearings_deg
+        self._ring = BearingScan(bearings_deg, self.options.scan_range_m) if bearings_deg else None
         for option in self.options.devices if self._dialect is messages.Wc2EcDialect.DRAFT else ():
             self._table.add(WebotsDevice(option.name, option.number, 0, option.kind))
         return self.driving
-
-    def _new_ring(self) -> BearingScan | None:
-        options = self.options
-        return BearingScan(options.bearings_deg, options.scan_range_m) if options.bearings_deg else None
 
     def begun(self, stamp_ns: int) -> tuple[Telemetry, ...]:
         if self._dialect is messages.Wc2EcDialect.DRAFT:

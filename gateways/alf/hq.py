@@ -70,9 +70,9 @@ class AlfClient(VehicleRole):
         if self.scanner is not None:
             self.outbox.withdraw(self.scanner)
 
-    def send_scanner(self, scanner: bytes | None) -> None:
+    def send_scanner(self, scanner: bytes) -> None:
         """Send a scanner init that the client does not have yet, before any measurement that needs it."""
-        if scanner is not None and scanner != self.scanner and self.laser:
+        if scanner != self.scanner and self.laser:
             self.outbox.clear("scan")
             self.outbox.put_exempt(scanner)
             self.scanner = scanner
@@ -95,14 +95,13 @@ class Sweep:
     ) -> None:
         self.source, self.scanner = _geometry(scan), scanner
         angle_min, increment, count, range_min, range_max = self.source
-        self.count = count
         self._points = points
-        known = scanner is not None and scanner.angle_min == angle_min and scanner.angle_increment == increment
+        self._places: npt.NDArray[np.intp] | None = None
+        angle_max = angle_min + increment * (count - 1)
         if count == points:
-            angle_max = scanner.angle_max if known and scanner is not None else angle_min + increment * (count - 1)
-            self._places: npt.NDArray[np.intp] | None = None
+            if scanner is not None and (scanner.angle_min, scanner.angle_increment) == (angle_min, increment):
+                angle_max = scanner.angle_max
         else:
-            angle_max = angle_min + increment * (count - 1)
             self._places = np.rint(np.linspace(0, max(0, count - 1), points)).astype(np.intp)
             increment = increment * (count - 1) / (points - 1) or math.radians(1.0)
         time_s = scanner.time_increment_s if scanner is not None else 0.0

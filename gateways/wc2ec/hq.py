@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterable
 from typing import Any, ClassVar
 
-from gateways.wc2ec.device_table import DeviceTable, SectorSensors, ShownDevice
+from gateways.wc2ec.device_table import DeviceTable, ShownDevice
 from gateways.wc2ec.devices import DISTANCE
 from gateways.wc2ec.hq_client import TRANSLATE, Wc2EcClient
 from gateways.wc2ec.messages import SensorData, Wc2EcDialect, Wc2EcMessage, write
@@ -44,9 +44,8 @@ class Wc2EcHq(HqSide):
         self._draft = self._dialect is Wc2EcDialect.DRAFT
         self.follows = ("scan",) if self._draft else ("scan", "scanner", "devices", "sensor/*")
         self._sessions: list[Wc2EcClient] = []
-        self._sectors = SectorSensors(options.sectors, options.sector_unit_m)
         left_out = (metrics or Metrics()).count("hq_devices_left_out")
-        self._table = DeviceTable(options, view, self._sectors, self._registered, left_out)
+        self._table = DeviceTable(options, view, self._registered, left_out)
         self._frames: dict[int, tuple[float, bytes]] = {}
         """The value that was encoded last of each device."""
         self._readings_gone: dict[str, Reading] = {}
@@ -145,7 +144,7 @@ class Wc2EcHq(HqSide):
             return _shown(device, reading.value, fault=reading.fault)
         if scan is None or scan is self._scan_gone or self.view.protocol in (None, NAME):
             return None
-        nearest = self._sectors.values(scan).get(device.name)
+        nearest = self._table.sectors.values(scan).get(device.name)
         return None if nearest is None else _shown(device, nearest)
 
     def _reading(self, name: str, message: Reading) -> Send | None:
@@ -164,7 +163,7 @@ class Wc2EcHq(HqSide):
         self._table.learn()
         if self.view.missing is not None:
             return None
-        shown = [(self._table.by_name.get(name), value) for name, value in self._sectors.values(scan).items()]
+        shown = [(self._table.by_name.get(name), value) for name, value in self._table.sectors.values(scan).items()]
         return self._data((device, _shown(device, value)) for device, value in shown if device is not None)
 
     def _data(self, values: Iterable[tuple[ShownDevice, float | None]]) -> Send | None:

@@ -285,7 +285,7 @@ class Session(Kept, ABC, Generic[M]):
             self._on(SessionEvent.AGREED)
 
     def lift_limit(self) -> None:
-        """Lift the time limit of the handshake: the protocol's own timers watch it from here."""
+        """Lift the time limit of the handshake: it is complete, or the protocol's own timers watch it from here."""
         self._limit_at = math.inf
 
     def send(self, message: M) -> None:
@@ -354,10 +354,6 @@ def _begin(session: Session[Any], reason: str, now: float) -> None:
     session.opened(now)
 
 
-def _settle(session: Session[Any], reason: str, now: float) -> None:
-    session._limit_at = math.inf
-
-
 def _leave(session: Session[Any], reason: str, now: float) -> None:
     session.reason, session.busy, session.doubts = reason, None, ()
     session._limit_at = now + LINGER_S
@@ -369,7 +365,7 @@ def _end(session: Session[Any], reason: str, now: float) -> None:
 
 _ACTIONS: dict[SessionEvent, Callable[[Session[Any], str, float], None]] = {
     SessionEvent.OPEN: _begin,
-    SessionEvent.AGREED: _settle,
+    SessionEvent.AGREED: lambda session, reason, now: session.lift_limit(),
     SessionEvent.CLOSE: _leave,
     SessionEvent.WRITTEN: _end,
     SessionEvent.OVERDUE: _end,

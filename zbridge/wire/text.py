@@ -95,18 +95,16 @@ class _TextField:
         self.whole = kind if isinstance(kind, Whole) else None
         self.read: Callable[[bytes], Any]
         self.write: Callable[[Any], bytes]
-        self.read, self.write = (_integers, _write_array) if self.array else _coder(field)
-
-
-def _coder(field: Field) -> tuple[Callable[[bytes], Any], Callable[[Any], bytes]]:
-    if not isinstance(field.wire, Scalar):
-        raise TypeError(f"{field.name}: {field.wire} has no form in text")
-    kind = _kind(field)
-    if kind is None:
-        return _read_truth, lambda value: b"1" if value else b"0"
-    if isinstance(kind, Decimal):
-        return _read_decimal, _write_decimal
-    return _whole(kind)
+        if self.array:
+            self.read, self.write = _integers, _write_array
+        elif not isinstance(field.wire, Scalar):
+            raise TypeError(f"{field.name}: {field.wire} has no form in text")
+        elif isinstance(kind, Whole):
+            self.read, self.write = _whole(kind)
+        elif isinstance(kind, Decimal):
+            self.read, self.write = _read_decimal, _write_decimal
+        else:
+            self.read, self.write = _read_truth, lambda value: b"1" if value else b"0"
 
 
 def _kind(field: Field) -> Whole | Decimal | None:

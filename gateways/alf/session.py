@@ -29,7 +29,6 @@ class AlfSession(Session[messages.AlfMessage]):
 
     kept: ClassVar[dict[str, Any]] = {"points": int, "_broken": bool}
     handled = frozenset({messages.End})
-    _SENT_BY_PEER: frozenset[int]
 
     def __init__(
         self,
@@ -42,7 +41,7 @@ class AlfSession(Session[messages.AlfMessage]):
     ) -> None:
         self.dialect = dialect
         self.points = points
-        self._ids = self._SENT_BY_PEER
+        self._ids = messages.sent_by(Role.ROBOT if self.role is Role.HQ else Role.HQ)
         self._broken = False
         self._points_from_scanner = points_from_scanner
         if dialect is messages.AlfDialect.TEXT:
@@ -97,7 +96,6 @@ class AlfHqRole(AlfSession):
 
     role = Role.HQ
     at_first: messages.DriveCommand | None = None
-    _SENT_BY_PEER = messages.sent_by(messages.AlfSender.VEHICLE)
 
     def opened(self, now: float) -> None:
         super().opened(now)
@@ -115,7 +113,6 @@ class VehicleRole(AlfSession):
     """We play the vehicle towards an HQ."""
 
     role = Role.ROBOT
-    _SENT_BY_PEER = messages.sent_by(messages.AlfSender.HQ)
 
 
 def points_of(scanner: messages.ScannerInit) -> int:

@@ -258,14 +258,21 @@ FOUND = (
     _mutant(
         "one released latch of two frees the robot",
         "zbridge/control/authority.py",
-        "            self.machine.events.append(Event(EventKind.UNLATCHED, _ANOTHER_GATEWAY))\n        if before and not self.latches:\n            self.machine.handle(Input.UNLATCH, Cause())\n",
-        "            self.machine.events.append(Event(EventKind.UNLATCHED, _ANOTHER_GATEWAY))\n            self.machine.handle(Input.UNLATCH, Cause())\n",
+        "            self.machine.events.append(Event(EventKind.UNLATCHED, _ANOTHER_GATEWAY))\n"
+        "        if before and not self.latches:\n"
+        "            self.machine.handle(Input.UNLATCH, Cause())\n",
+        "            self.machine.events.append(Event(EventKind.UNLATCHED, _ANOTHER_GATEWAY))\n"
+        "            self.machine.handle(Input.UNLATCH, Cause())\n",
     ),
     _mutant(
         "a restart that is undone loses the claim",
         "zbridge/app/handover/restarts.py",
-        "        if self._withdrawn and self._claim is not None:\n            self._ownership.restore(self._claim)\n        self._ownership.hands_over = self._withdrawn = False\n",
-        "        self._ownership.hands_over = self._withdrawn = False\n        if self._withdrawn and self._claim is not None:\n            self._ownership.restore(self._claim)\n",
+        "        if self._withdrawn and self._claim is not None:\n"
+        "            self._ownership.restore(self._claim)\n"
+        "        self._ownership.hands_over = self._withdrawn = False\n",
+        "        self._ownership.hands_over = self._withdrawn = False\n"
+        "        if self._withdrawn and self._claim is not None:\n"
+        "            self._ownership.restore(self._claim)\n",
     ),
     _mutant(
         "a refused push is no push",
@@ -282,7 +289,8 @@ FOUND = (
     _mutant(
         "a stick of ALF at rest turns other robots",
         "gateways/alf/hq.py",
-        "        if not speed and self.view.protocol != NAME:  # it only sets wheels; other robots would turn on the spot\n            right = 0.0\n",
+        "        if not speed and self.view.protocol != NAME:  # it only sets wheels; other robots would turn on the spot\n"
+        "            right = 0.0\n",
         "",
     ),
     _mutant(

@@ -289,9 +289,8 @@ FOUND = (
     _mutant(
         "a stick of ALF at rest turns other robots",
         "gateways/alf/hq.py",
-        "        if not speed and self.view.protocol != NAME:  # it only sets wheels; other robots would turn on the spot\n"
-        "            right = 0.0\n",
-        "",
+        "        if not speed and self.view.protocol != NAME:",
+        "        if False:",
     ),
     _mutant(
         "a motor that runs backward counts as neutral",

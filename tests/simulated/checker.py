@@ -20,6 +20,7 @@ from tests.simulated.stops import StopRules
 from tests.simulated.written import Written
 
 if TYPE_CHECKING:
+    from tests.simulated.hq_programs import HqProgram
     from tests.simulated.scenario import Simulation
 
 NEW = "+"
@@ -72,6 +73,7 @@ class Checker:
         self._taken_at: dict[str, float] = {}
         """By the name of a holder, when a stop or a takeover ended its lease."""
         self._wrote_motion: dict[str, float] = {}
+        self._paused_at: dict[str, float] = {}
         self._met: dict[frozenset[str], float] = {}
         self._handlers = {
             "asks": self._on_asks,
@@ -88,6 +90,8 @@ class Checker:
             "killed": self._on_ended,
             "ended": self._on_ended,
             "was suspended": self._on_suspended,
+            "paused": self._on_paused,
+            "resumed": self._on_resumed,
             "gives": self._on_gives,
             "crashed": lambda who, why: self.violate("fragile", f"{who} crashed: {why}"),
         }
@@ -131,9 +135,10 @@ class Checker:
             stop_id = request.get("id", b"")
             self._unlatched[stop_id].add(gateway)
             self._released_at.setdefault(stop_id, self.world.now)
-            for name, known in self.latches.items():
-                if known.pop(stop_id, None) is not None and name != gateway:
-                    self.uncertain.add(stop_id)  # that gateway has still to learn of it
+            for known in self.latches.values():
+                known.pop(stop_id, None)
+            if len(self.latches) > 1:
+                self.uncertain.add(stop_id)  # another gateway may still have to learn of it
         elif answer.get("ok") and verb in ("acquire", "takeover"):
             grant, last = Grant(gateway, asker, answer, request, self.world.now), self.current.get(gateway)
             stands = last is not None and last.ended_at is None and last.shown and not last.expires_by(self.world.now)
@@ -218,6 +223,15 @@ class Checker:
                 self.counts["excused: killed before a latch was written"] += 1
             self.end(who, "gateway ended")
 
+    def _on_paused(self, who: str) -> None:
+        self._paused_at[who] = self.world.now
+
+    def _on_resumed(self, who: str) -> None:
+        """A restart that was asked for in a pause ends the lease after it."""
+        grant, paused_at = self.current.get(who), self._paused_at.get(who, 0.0)
+        if grant is not None and grant.why == "gateway restarted" and (grant.ended_at or 0.0) >= paused_at:
+            grant.ended_at = self.world.now
+
     def _on_suspended(self, who: str, seconds: float) -> None:
         if seconds > 0.15:
             self.end(who, "suspended")
@@ -278,26 +292,32 @@ class Checker:
 
     def _of_program(self, listener: str, command: Command) -> None:
         """A listener's motion was said by an HQ program a moment ago."""
-        now = self.world.now
-        for program in self.simulation.programs:
-            most_s = HQ_DEADMAN_S[program.protocol] + 0.35
-            if program.options.get("once") and self.released.holds(program, command.value, most_s):
-                return
-            later: float | None = None  # of two wheels one may have the next value
-            for at, value in reversed(self._gives[program.name]):
-                if now - at > most_s:
-                    break
-                other = later if later is not None and program.protocol == "wc2ec" else value
-                later = value
-                if min(value, other) - 0.0052 < command.value < max(value, other) + 0.0052:
-                    self.released.put(program.name, list(self._gives[program.name]))
-                    if program.protocol == "tcpudp":  # one value a command
-                        self.released.put_late(listener, program.name, at, list(self._gives[program.name]))
-                    return
-        if self.released.waited(command.value, self._gives):
+        programs = self.simulation.programs
+        said = {each.name: at for each in programs if (at := self._said(each, command.value)) is not None}
+        if not said and self.released.waited(command.value, self._gives):
             self.counts["excused: pushed during a cut, from the centre"] += 1
-            return
-        self.violate("hq-motion", f"{listener} put {command}, which no HQ program said lately")
+        elif not said:
+            self.violate("hq-motion", f"{listener} put {command}, which no HQ program said lately")
+        elif len(said) == 1:
+            ((program, at),) = said.items()
+            self.released.put(program, list(self._gives[program]))
+            if any(each.name == program and each.protocol == "tcpudp" for each in programs):  # one value a command
+                self.released.put_late(listener, program, at, list(self._gives[program]))
+
+    def _said(self, program: HqProgram, motion: float) -> float | None:
+        """Return when a program said this motion, within its deadman; None if it did not."""
+        now, most_s = self.world.now, HQ_DEADMAN_S[program.protocol] + 0.35
+        if program.options.get("once") and self.released.holds(program, motion, most_s):
+            return now
+        later: float | None = None  # of two wheels one may have the next value
+        for at, value in reversed(self._gives[program.name]):
+            if now - at > most_s:
+                break
+            other = later if later is not None and program.protocol == "wc2ec" else value
+            later = value
+            if min(value, other) - 0.0052 < motion < max(value, other) + 0.0052:
+                return at
+        return None
 
     def wrote_motion_at(self, gateway: str) -> float:
         """Return when a gateway wrote motion last."""

@@ -27,8 +27,8 @@ NEW = "+"
 """Behind the name of a gateway's successor, until *go*."""
 WRITTEN_S = 0.02
 """Seconds that writing a latched stop takes."""
-KNOWN_S = 8.0
-"""Two gateways that see each other for so long know the same latched stops."""
+KNOWN_S = 1.5
+"""Longest time until a gateway that has met the other one knows its latched stops: it asks every 0.5 s."""
 MEET_S = 3.0
 """Two gateways that see each other for so long: exactly one grants."""
 LOOK_S = 0.6
@@ -257,7 +257,7 @@ class Checker:
     def _share_latches(self, one: str, other: str) -> None:
         """Two gateways of one robot that met for long know of each other's latches."""
         now = self.world.now
-        if self._met_for(one, other) < KNOWN_S:
+        if self._met_for(one, other) < MEET_S:
             return
         for here, there in ((one, other), (other, one)):
             for stop_id, at in self.latches[here].items():
@@ -265,9 +265,9 @@ class Checker:
                     self.latches[there].setdefault(stop_id, now)
 
     def _share_releases(self, pair: frozenset[str]) -> None:
-        """Two gateways of one robot that met since a latched stop was released both know that."""
+        """A gateway that met the one that serves the robot, and has released a latched stop, knows that."""
         for stop_id, names in self._unlatched.items():
-            if names & pair and self.world.now - self._released_at[stop_id] > MEET_S:
+            if any(map(self.obligations.serves, names & pair)) and self.world.now - self._released_at[stop_id] > MEET_S:
                 self.uncertain.discard(stop_id)
 
     def _met_for(self, one: str, other: str) -> float:

@@ -65,7 +65,7 @@ def _latched_and_owner_gone(rng: random.Random, made: Made) -> None:
     steps = split(rng, made, t=3.5, s=rng.uniform(9.0, 11.0))
     t = 3.5 + steps[0]["for"] + 5.0
     latches = [{"t": t, "who": who, "do": "latch"} for who in ("op1", "op2")]
-    made["steps"] = [*steps, *latches, fault(t + rng.uniform(1.5, 3.0), "kill", target="owner") | {"for": 30.0}]
+    made["steps"] = [*steps, *latches, fault(t + rng.uniform(2.0, 3.0), "kill", target="owner") | {"for": 30.0}]
     made["steps"] += [drive(t + after, who) for after in (6.0, 9.0) for who in ("op1", "op2")]
 
 

@@ -124,6 +124,8 @@ class Wc2EcRobot(RobotSide):
         entered = self._table.add(device)
         if entered is None:
             raise ProtocolError(f"device {message.number} registered again, as {device.shown!r}")
+        if entered.kind == ROTATIONAL and self.ready:  # not known when the robot was stopped: one read may bring all
+            self._set_motor(entered, 0.0, 0.0, urgent=True)
         shown: list[Telemetry] = [(topics.DEVICES, self._table.message(stamp_ns))]
         if entered.name != device.name:
             text = f"{self._table.collisions[-1]}: the second is shown as {entered.shown!r}"

@@ -513,6 +513,7 @@ def test_what_a_webots_robot_sent_passes_the_bus_and_reaches_a_controller_as_it_
             scene.tell(topic, payload.decode(topic.message, payload.encode(telemetry)))
         written += scene.told()
     assert written == sent.replace(b"\x00\x2e\x01\x01a", b"\x00\x2e\x01\x03a#1")
+    drained(session)  # the stops of motors that came in the read that established the session
     motor = next(one.number for one in Reader("deployed").take(sent) if one.node_type in (ROTATIONAL, LINEAR))
     ((topic, command),) = scene.says(set_value(motor, 0.5))
     robot.command(topic, command, 0.0)

@@ -81,8 +81,10 @@ class Wire:
 
     @classmethod
     def of(cls, robot: str) -> Self:
-        """One of the ROBOTS; those of legacy programs are the CAR, which has sent data."""
-        return cls(b"" if robot.startswith("draft") else READY, **ROBOTS[robot])
+        """One of the ROBOTS; those of legacy programs are the CAR, which has sent data, and was sent its stop."""
+        made = cls(b"" if robot.startswith("draft") else READY, **ROBOTS[robot])
+        made.frames()
+        return made
 
     def connect(self, greeting: bytes = b"") -> tuple[tuple[Topic, FleetMessage], ...]:
         """Connect, for the first time or again; give what the fleet is told at once."""
@@ -241,6 +243,13 @@ def test_a_new_connection_begins_with_a_fresh_table(car: Wire) -> None:
     assert car.reading(data(5, 1.0))[0] == "sensor/distance-5"
 
 
+def test_motors_that_come_in_the_read_that_establishes_the_session_or_later_are_stopped() -> None:
+    wire = Wire(READY, **ROBOTS["car"])
+    assert wire.values() == STOPPED
+    wire.told(registration(ROTATIONAL, 9, b"arm") + registration(LINEAR, 10, b"lift two"))
+    assert wire.values() == {9: 0.0}
+
+
 def test_255_devices_may_be_registered_and_every_rotational_motor_is_stopped_at_once() -> None:
     wire = Wire(b"".join(registration(ROTATIONAL, number, b"m%d" % number) for number in range(254)))
     assert len(wire.table(registration(DISTANCE, 254, b"eye"))) == 255
@@ -324,7 +333,9 @@ def test_sensors_with_bearings_are_a_scan_too_once_each_has_a_value_of_this_conn
     ROBOTS,
 )
 def test_what_is_told_of_the_robot_and_what_leaves_for_it(options: dict[str, Any], steps: list[str]) -> None:
-    Wire(b"" if "dialect" in options else READY, **options).play(steps)
+    wire = Wire(b"" if "dialect" in options else READY, **options)
+    wire.frames()
+    wire.play(steps)
 
 
 def test_a_webots_robot_cannot_be_asked_for_anything(car: Wire) -> None:

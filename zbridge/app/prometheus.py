@@ -15,7 +15,7 @@ from collections.abc import AsyncIterator, Callable, Sequence
 
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
-from zbridge.transport.waiting import waiting_sockets
+from zbridge.transport.door import waiting_sockets
 
 log = logging.getLogger("zbridge.metrics")
 

@@ -133,7 +133,7 @@ class Scene(HqScene):
                 case ["client"]:
                     self.connect()
                 case [client, "leaves"]:
-                    self.clients[int(client)].lost("EOF")
+                    self.clients[int(client)].fail("EOF")
                 case [client, "sets", number, value, ">", *expected]:
                     assert self.sets(int(number), float(value), int(client)) == " ".join(expected), step
                 case [client, *expected]:
@@ -286,7 +286,7 @@ def test_numbers_of_names_that_are_gone_are_given_to_others_but_never_while_a_co
         scene.play(f"robot goes; table {' '.join(f'{name}/distance' for name in names)}; is wc2ec; client")
         assert understood(scene.told(connection)).startswith(" ".join(f"{name}/37" for name in names))
         if connection < 4:
-            scene.clients[connection].lost("gone")
+            scene.clients[connection].fail("gone")
     assert most_kept(scene.side, depth=2) == 255
     scene.play("table new/0/distance; reads new/0 1; 4:")
 

@@ -235,7 +235,7 @@ def test_a_number_that_is_registered_twice_is_a_protocol_error_and_changes_nothi
 
 
 def test_a_new_connection_begins_with_a_fresh_table(car: Wire) -> None:
-    car.session.lost("closed by peer")
+    car.session.fail("closed by peer")
     car.connect()
     car.play(["refused motor/fl value=1"])
     assert car.table(registration(DISTANCE, 0, b"fl")) == [Device("fl", 0, "distance")]
@@ -412,13 +412,13 @@ def test_a_sensor_of_the_draft_is_enabled_while_somebody_listens_and_a_pinned_on
     ):
         wire.robot.listened(topic, on=on)
         assert b"".join(wire.frames()) == bytes.fromhex(sent)
-    wire.session.lost("closed by peer")
+    wire.session.fail("closed by peer")
     wire.robot.listened(one, on=False)
     wire.robot.listened(two, on=True)
     for _ in range(2):  # who listens while nobody is connected is remembered for every connection
         wire.connect()
         assert wire.frames() == [bytes.fromhex("80 00 01"), bytes.fromhex("80 00 02")]
-        wire.session.lost("closed by peer")
+        wire.session.fail("closed by peer")
 
 
 def test_all_sensors_may_be_pinned_and_are_enabled_at_once() -> None:

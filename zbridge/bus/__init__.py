@@ -7,6 +7,7 @@ without it.
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -25,6 +26,8 @@ from zbridge.bus.interface import (
     Sort,
     Tls,
 )
+from zbridge.bus.tls.files import own_certificate
+from zbridge.bus.tls.membership import require_member
 from zbridge.errors import ConfigError
 from zbridge.fleet.topics import SizeBounds
 from zbridge.metrics import Metrics
@@ -75,20 +78,21 @@ async def open_bus(
     timestamps: Zenoh stamps what is put here; kept frames need that. threads: each subscription has a thread, which
     relieves Zenoh's own at tens of thousands of samples a second; False saves each sample a change of threads.
     """
-    from zbridge.bus.zenoh import open_zenoh
+    from zbridge.bus.zenoh import ZenohBus, open_or_explain, zenoh_config
 
-    return await open_zenoh(
-        settings,
-        metrics,
-        wait_for_peers=wait_for_peers,
-        bounds=bounds,
-        within_s=within_s,
-        realm=realm,
-        robot=robot,
-        timestamps=timestamps,
-        explain=explain,
-        threads=threads,
+    config = zenoh_config(
+        settings, wait_for_peers=wait_for_peers, bounds=bounds, within_s=within_s, timestamps=timestamps
     )
+    session = await open_or_explain(config, settings, explain=explain)
+    bus = ZenohBus(session, asyncio.get_running_loop(), metrics, stream=settings.stream, threads=threads)
+    certificate = own_certificate(settings.tls)
+    if certificate is not None and realm is not None:
+        try:
+            await require_member(bus.ask, bus.routers(), certificate, realm, robot)
+        except BaseException:
+            await bus.close()
+            raise
+    return bus
 
 
 async def open_router(

@@ -11,10 +11,8 @@ from typing import Any, TypeVar
 import zenoh
 
 from zbridge.bus.inbox import Inbox
-from zbridge.bus.interface import Answer, BusSettings, Handle, IncomingQuery, PriorityClass, Publisher, Sample, Sort
+from zbridge.bus.interface import Answer, Handle, IncomingQuery, PriorityClass, Publisher, Sample, Sort
 from zbridge.bus.late_join import LateJoin
-from zbridge.bus.tls.files import own_certificate
-from zbridge.bus.tls.membership import require_member
 from zbridge.bus.writer import Writer
 from zbridge.bus.zenoh.alive import AliveWatches, Changed
 from zbridge.bus.zenoh.answers import Answers
@@ -32,10 +30,10 @@ from zbridge.bus.zenoh.incoming import (
     read_reply,
     subscribe_with_kept,
 )
-from zbridge.bus.zenoh.opening import in_short, open_or_explain, zenoh_config
-from zbridge.bus.zenoh.publishers import FramePublisher, Publishers
+from zbridge.bus.zenoh.opening import in_short
+from zbridge.bus.zenoh.publishers import Publishers
 from zbridge.errors import BusError
-from zbridge.fleet.topics import SizeBounds, Topic
+from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
 
 H = TypeVar("H", bound=Handle)
@@ -46,35 +44,6 @@ FLUSH_S = 2.0
 """Longest wait of :meth:`ZenohBus.flush`, seconds."""
 _TIDY = 64
 """Handles that are kept before closed ones are forgotten."""
-
-
-async def open_zenoh(
-    settings: BusSettings,
-    metrics: Metrics,
-    *,
-    wait_for_peers: bool = False,
-    bounds: SizeBounds = (),
-    within_s: float = 1.0,
-    realm: str | None = None,
-    robot: str | None = None,
-    timestamps: bool = False,
-    explain: bool = True,
-    threads: bool = True,
-) -> ZenohBus:
-    """Open a Zenoh session; raise BusError if that is not possible (a client: no router within ``within_s``)."""
-    config = zenoh_config(
-        settings, wait_for_peers=wait_for_peers, bounds=bounds, within_s=within_s, timestamps=timestamps
-    )
-    session = await open_or_explain(config, settings, explain=explain)
-    bus = ZenohBus(session, asyncio.get_running_loop(), metrics, stream=settings.stream, threads=threads)
-    certificate = own_certificate(settings.tls)
-    if certificate is not None and realm is not None:
-        try:
-            await require_member(bus.ask, [str(zid) for zid in session.info.routers_zid()], certificate, realm, robot)
-        except BaseException:
-            await bus.close()
-            raise
-    return bus
 
 
 class ZenohBus:
@@ -95,7 +64,7 @@ class ZenohBus:
         self._threads = threads
         self._loop = loop
         self._stream = stream
-        self._lossless = lossless = stream == "block"
+        lossless = stream == "block"
         self._shares = beside is not None
         self._inbox = Inbox(loop, metrics)
         self._inboxes: list[Inbox] = beside._inboxes if beside is not None else []
@@ -222,35 +191,21 @@ class ZenohBus:
         await self._collect(key_expr, lambda handler: self._session.get(key_expr, handler, timeout=1.0, **options), 1.0)
 
     async def _flush(self, writer: Writer) -> None:
-        loop = self._loop
-        written: asyncio.Future[None] = loop.create_future()
-
-        def tell() -> None:
-            if not written.done():
-                written.set_result(None)
-
-        def ring() -> None:
-            loop.call_soon_threadsafe(tell)
-
-        writer.put(ring)
+        written = asyncio.Event()
+        writer.put(lambda: self._loop.call_soon_threadsafe(written.set))
         try:
             async with asyncio.timeout(FLUSH_S):
-                await written
+                await written.wait()
         except TimeoutError:
             raise BusError(f"the bus accepted nothing for {FLUSH_S:g} s") from None
 
     def frames(
         self, key: str, listened: Callable[[bool], None], *, best_effort: bool = False, kept: int = 0
     ) -> Publisher:
-
         def changed(matching: bool) -> None:
             self._loop.call_soon_threadsafe(listened, matching)
 
-        return self._keep(
-            FramePublisher(
-                self._session, key, self._streams, changed, best_effort=best_effort, kept=kept, blocks=self._lossless
-            )
-        )
+        return self._keep(self._publishers.frames(key, changed, best_effort=best_effort, kept=kept))
 
     def watch_listeners(self, key: str, handler: Callable[[bool], None]) -> Handle:
         return self.frames(key, handler)
@@ -299,19 +254,13 @@ class ZenohBus:
 
     async def _collect(self, key_expr: str, start: Callable[[Any], Any], timeout_s: float) -> list[Any]:
         """Run a get and collect its replies. Zenoh drops the handler after the last reply, which ends the wait."""
-        loop, replies = self._loop, Replies(key_expr, self._replies_dropped)
-        done = loop.create_future()
-
-        def finish() -> None:
-            if not done.done():
-                done.set_result(None)
-
-        handler = zenoh.handlers.Callback(replies.take, lambda: loop.call_soon_threadsafe(finish))
+        replies, done = Replies(key_expr, self._replies_dropped), asyncio.Event()
+        handler = zenoh.handlers.Callback(replies.take, lambda: self._loop.call_soon_threadsafe(done.set))
         try:
             await asyncio.to_thread(start, handler)
         except zenoh.ZError as error:
             raise BusError(in_short(error)) from error
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout_s + 0.5):  # wait_for of Python 3.11 may lose a cancellation
-                await done
+                await done.wait()
         return list(replies)

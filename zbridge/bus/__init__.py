@@ -11,21 +11,19 @@ import asyncio
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from zbridge.bus.interface import (
-    Answer,
-    Batch,
-    Bus,
-    BusSettings,
-    Handle,
-    IncomingQuery,
-    Neighbour,
-    PriorityClass,
-    Publisher,
-    ReadPayload,
-    Sample,
-    Sort,
-    Tls,
-)
+from zbridge.bus.interface import Answer as Answer
+from zbridge.bus.interface import Batch as Batch
+from zbridge.bus.interface import Bus as Bus
+from zbridge.bus.interface import BusSettings as BusSettings
+from zbridge.bus.interface import Handle as Handle
+from zbridge.bus.interface import IncomingQuery as IncomingQuery
+from zbridge.bus.interface import Neighbour as Neighbour
+from zbridge.bus.interface import PriorityClass as PriorityClass
+from zbridge.bus.interface import Publisher as Publisher
+from zbridge.bus.interface import ReadPayload as ReadPayload
+from zbridge.bus.interface import Sample as Sample
+from zbridge.bus.interface import Sort as Sort
+from zbridge.bus.interface import Tls as Tls
 from zbridge.bus.tls.files import own_certificate
 from zbridge.bus.tls.membership import require_member
 from zbridge.errors import ConfigError
@@ -34,27 +32,6 @@ from zbridge.metrics import Metrics
 
 OPEN_S = 1.0
 """Time limit of one attempt to open a client session, seconds."""
-
-__all__ = [
-    "OPEN_S",
-    "Answer",
-    "Batch",
-    "Bus",
-    "BusSettings",
-    "Handle",
-    "IncomingQuery",
-    "Neighbour",
-    "PriorityClass",
-    "Publisher",
-    "ReadPayload",
-    "Sample",
-    "Sort",
-    "Tls",
-    "open_bus",
-    "open_router",
-    "read_key_expr",
-    "read_zenoh_log",
-]
 
 
 async def open_bus(

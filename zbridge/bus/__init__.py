@@ -7,7 +7,6 @@ without it.
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -24,8 +23,6 @@ from zbridge.bus.interface import ReadPayload as ReadPayload
 from zbridge.bus.interface import Sample as Sample
 from zbridge.bus.interface import Sort as Sort
 from zbridge.bus.interface import Tls as Tls
-from zbridge.bus.tls.files import own_certificate
-from zbridge.bus.tls.membership import require_member
 from zbridge.errors import ConfigError
 from zbridge.fleet.topics import SizeBounds
 from zbridge.metrics import Metrics
@@ -55,21 +52,12 @@ async def open_bus(
     timestamps: Zenoh stamps what is put here; kept frames need that. threads: each subscription has a thread, which
     relieves Zenoh's own at tens of thousands of samples a second; False saves each sample a change of threads.
     """
-    from zbridge.bus.zenoh import ZenohBus, open_or_explain, zenoh_config
+    from zbridge.bus.zenoh import open_zenoh, zenoh_config
 
     config = zenoh_config(
         settings, wait_for_peers=wait_for_peers, bounds=bounds, within_s=within_s, timestamps=timestamps
     )
-    session = await open_or_explain(config, settings, explain=explain)
-    bus = ZenohBus(session, asyncio.get_running_loop(), metrics, stream=settings.stream, threads=threads)
-    certificate = own_certificate(settings.tls)
-    if certificate is not None and realm is not None:
-        try:
-            await require_member(bus.ask, bus.routers(), certificate, realm, robot)
-        except BaseException:
-            await bus.close()
-            raise
-    return bus
+    return await open_zenoh(config, settings, metrics, realm=realm, robot=robot, explain=explain, threads=threads)
 
 
 async def open_router(

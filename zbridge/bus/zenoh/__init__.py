@@ -14,8 +14,8 @@ import os
 # One thread that receives instead of several that wake one another for each message; read when zenoh is imported.
 os.environ.setdefault("ZENOH_RUNTIME", "(rx: (worker_threads: 1), acc: (handover: rx))")
 
-from zbridge.bus.zenoh.opening import canonical, open_or_explain, zenoh_config
+from zbridge.bus.zenoh.opening import canonical, zenoh_config
 from zbridge.bus.zenoh.router import open_router, read_log
-from zbridge.bus.zenoh.session import ZenohBus
+from zbridge.bus.zenoh.session import ZenohBus, open_zenoh
 
-__all__ = ["ZenohBus", "canonical", "open_or_explain", "open_router", "read_log", "zenoh_config"]
+__all__ = ["ZenohBus", "canonical", "open_router", "open_zenoh", "read_log", "zenoh_config"]

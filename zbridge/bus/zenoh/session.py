@@ -11,8 +11,10 @@ from typing import Any, TypeVar
 import zenoh
 
 from zbridge.bus.inbox import Inbox
-from zbridge.bus.interface import Answer, Handle, IncomingQuery, PriorityClass, Publisher, Sample, Sort
+from zbridge.bus.interface import Answer, BusSettings, Handle, IncomingQuery, PriorityClass, Publisher, Sample, Sort
 from zbridge.bus.late_join import LateJoin
+from zbridge.bus.tls.files import own_certificate
+from zbridge.bus.tls.membership import require_member
 from zbridge.bus.writer import Writer
 from zbridge.bus.zenoh.alive import AliveWatches, Changed
 from zbridge.bus.zenoh.answers import Answers
@@ -30,7 +32,7 @@ from zbridge.bus.zenoh.incoming import (
     read_reply,
     subscribe_with_kept,
 )
-from zbridge.bus.zenoh.opening import in_short
+from zbridge.bus.zenoh.opening import in_short, open_or_explain
 from zbridge.bus.zenoh.publishers import Publishers
 from zbridge.errors import BusError
 from zbridge.fleet.topics import Topic
@@ -44,6 +46,29 @@ FLUSH_S = 2.0
 """Longest wait of :meth:`ZenohBus.flush`, seconds."""
 _TIDY = 64
 """Handles that are kept before closed ones are forgotten."""
+
+
+async def open_zenoh(
+    config: zenoh.Config,
+    settings: BusSettings,
+    metrics: Metrics,
+    *,
+    realm: str | None,
+    robot: str | None,
+    explain: bool,
+    threads: bool,
+) -> ZenohBus:
+    """Open a session of this configuration for :func:`zbridge.bus.open_bus`."""
+    session = await open_or_explain(config, settings, explain=explain)
+    bus = ZenohBus(session, asyncio.get_running_loop(), metrics, stream=settings.stream, threads=threads)
+    certificate = own_certificate(settings.tls)
+    if certificate is not None and realm is not None:
+        try:
+            await require_member(bus.ask, bus.routers(), certificate, realm, robot)
+        except BaseException:
+            await bus.close()
+            raise
+    return bus
 
 
 class ZenohBus:

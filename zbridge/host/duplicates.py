@@ -74,22 +74,17 @@ class Duplicate(msgspec.Struct):
         return True
 
     def _write(self, data: bytes, *, datagram: bool) -> bool:
-        if not self.descriptors or not self.boundary.outgoing:
+        if len(self.descriptors) < (2 if datagram else 1) or not self.boundary.outgoing:
             return False
         try:
-            if datagram:
-                return self._send_datagram(data)
-            return os.write(self.descriptors[0], data) == len(data)
+            if not datagram:
+                return os.write(self.descriptors[0], data) == len(data)
+            with _borrowed(self.descriptors[0]) as robot, _borrowed(self.descriptors[1]) as own:
+                # To where the stream leads: a robot takes datagrams at the same address and port.
+                return own.sendto(data, socket.MSG_DONTWAIT, robot.getpeername()) == len(data)
         except OSError as error:
             log.debug("%s: no stop written: %s", self.name, error)
             return False
-
-    def _send_datagram(self, data: bytes) -> bool:
-        """Send to where the stream leads: a robot takes datagrams at the same address and port."""
-        if len(self.descriptors) < 2:
-            return False
-        with _borrowed(self.descriptors[0]) as robot, _borrowed(self.descriptors[1]) as own:
-            return own.sendto(data, socket.MSG_DONTWAIT, robot.getpeername()) == len(data)
 
 
 @contextlib.contextmanager

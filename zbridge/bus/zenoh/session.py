@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import zenoh
+import zenoh.ext
 
 from zbridge.bus.inbox import Inbox
 from zbridge.bus.interface import Answer, BusSettings, Handle, IncomingQuery, PriorityClass, Publisher, Sample, Sort
@@ -30,7 +31,6 @@ from zbridge.bus.zenoh.incoming import (
     rate_limiting,
     read_change,
     read_reply,
-    subscribe_with_kept,
 )
 from zbridge.bus.zenoh.opening import in_short, open_or_explain
 from zbridge.bus.zenoh.publishers import Publishers
@@ -141,8 +141,10 @@ class ZenohBus:
         store: Any = direct_callback(key_expr, handler) if direct else loop_callback(self._inbox, handler, priority)
         if direct or not self._threads:
             store = prompt(store)
-        if kept:
-            return self._keep(Declared(subscribe_with_kept(self._session, key_expr, store)))
+        if kept:  # what advanced publishers keep, too, now and whenever one appears
+            kept_ones = zenoh.ext.HistoryConfig(detect_late_publishers=True)
+            advanced = zenoh.ext.declare_advanced_subscriber(self._session, key_expr, store, history=kept_ones)
+            return self._keep(Declared(advanced))
         return self._keep(Declared(self._session.declare_subscriber(key_expr, store)))
 
     def answer(
@@ -206,11 +208,9 @@ class ZenohBus:
         return Declared(watch)
 
     async def flush(self) -> None:
-        """Wait until all queued states and answers are handed to Zenoh; raise BusError after :data:`FLUSH_S`."""
         await self._flush(self._writer)
 
     async def drain(self, key_expr: str) -> None:
-        """Wait until all that was published has left: a query of the lowest priority follows it."""
         await self._flush(self._streams)
         options: Any = {"priority": zenoh.Priority.BACKGROUND, "congestion_control": zenoh.CongestionControl.BLOCK}
         await self._collect(key_expr, lambda handler: self._session.get(key_expr, handler, timeout=1.0, **options), 1.0)

@@ -284,8 +284,7 @@ class RobotDevice(Transferable):
     async def prepare(self, reason: str, within_s: float) -> None:
         """Stop the robot, end the lease and take no commands; wait until the links can be handed over.
 
-        A robot that was driven, and misses some stops, is sent more of them first: nothing is written later, for as
-        long as a successor takes that is slow, or hangs.
+        A driven robot that misses some stops is sent more of them first: a successor that hangs writes nothing.
         Raises Refused with the reason where that takes longer than ``within_s``; :meth:`resume` takes it all back.
         """
         if not self._context.robot.hands_over:

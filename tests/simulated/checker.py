@@ -216,8 +216,9 @@ class Checker:
 
     def _on_ended(self, who: str) -> None:
         if who in self.gateways:
-            unwritten = [each for each, at in self.latches[who].items() if self.world.now - at < WRITTEN_S]
-            for stop_id in unwritten:  # nobody has confirmed it yet
+            written_s = WRITTEN_S + 2 * self.gateways[who].host.thread_s
+            unwritten = [each for each, at in self.latches[who].items() if self.world.now - at < written_s]
+            for stop_id in set(unwritten) - self.stops.told:  # nobody has confirmed it yet
                 del self.latches[who][stop_id]
                 self.uncertain.add(stop_id)
                 self.counts["excused: killed before a latch was written"] += 1

@@ -85,15 +85,17 @@ class HqProgram(Process):
         if not self.ready:
             self.ready = True
             self.world.note(self.name, "established")
-            self.repeat(self._connection)
+            if self.options.get("once"):
+                self.say(0.0)
+            else:
+                self.repeat(self._connection)
 
     def repeat(self, connection: int) -> None:
         """Say it again."""
         if self.end is not None and self.ready and connection == self._connection:
-            if self.value_now and not self.options.get("once"):
+            if self.value_now:
                 self.value_now = self.value()
-            if not self.options.get("once"):
-                self.say(self.value_now)
+            self.say(self.value_now)
             self.after(self.every_s, lambda: self.repeat(connection))
 
     def value(self) -> float:

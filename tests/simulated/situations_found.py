@@ -216,14 +216,14 @@ def _controller_that_computes(rng: random.Random, made: Made) -> None:
     gateway["hq"], gateway["hold"] = ["wc2ec"], True
     made["programs"][0] |= {"protocol": "wc2ec", "options": {"once": True}}
     t = rng.uniform(5.0, 6.0)
-    ends = rng.choice(("cut", "leave", "pause", ""))
-    made["steps"] = [drive(3.5, "stick1") | {"for": rng.uniform(1.5, 4.0)}]
+    ends = rng.choice(("cut", "cut", "leave", "pause"))
+    made["steps"] = [drive(3.5, "stick1") | {"for": rng.uniform(3.0, 8.0)}]
     if ends == "cut":
         cut = fault(t, "cut", between=["desk1", gateway["host"]]) | {"for": rng.uniform(2.0, 5.0)}
         made["steps"].append(cut)
     elif ends == "leave":
         made["steps"].append({"t": t, "who": "stick1", "do": "leave"})
-    elif ends:
+    else:
         made["steps"].append(fault(t, ends, target=gateway["name"]) | {"for": rng.uniform(0.3, 2.0)})
 
 
@@ -268,6 +268,17 @@ def _one_wheel_pushed(rng: random.Random, made: Made) -> None:
     made["steps"] = [drive(3.5, "stick1") | {"for": 6.0}, stop]
 
 
+def _latched_before_the_disk(rng: random.Random, made: Made) -> None:
+    """A gateway whose disk is slow is killed about when its robot is latched; somebody else asks for the robot."""
+    for each in made["drivers"]:
+        each |= {"options": {}, "router": "router1"}
+    slow = fault(3.5, "threads", target="gw1", by=1.2) | {"for": 3.0}
+    kill = fault(3.9, "kill", target="gw1", when="stop unwritten", after=round(rng.uniform(0.1, 0.4), 3))
+    latch = {"t": 4.0, "who": "op2", "do": "latch"}
+    made["steps"] = [slow, latch, kill | {"for": rng.uniform(0.2, 1.0)}]
+    made["steps"] += [drive(t, "op1") | {"for": 1.0} for t in (6.5, 8.5, 10.5)]
+
+
 FOUND: tuple[Callable[[random.Random, Made], None], ...] = (
     _cut_when_granted,
     _cut_when_granted,
@@ -294,4 +305,5 @@ FOUND: tuple[Callable[[random.Random, Made], None], ...] = (
     _killed_before_the_disk,
     _one_wheel_is_let_go,
     _one_wheel_pushed,
+    _latched_before_the_disk,
 )

@@ -112,6 +112,18 @@ def _undone_restart(rng: random.Random, made: Made) -> None:
         made["steps"] += [drive(t + 2.0, who, takeover=True) | {"for": 2.0} for who in ("op1", "op2")]
 
 
+def _failed_restarts_and_owner_gone(rng: random.Random, made: Made) -> None:
+    """The restarts of both gateways fail; then the one that serves the robot is killed, and stays away."""
+    second_gateway(made)
+    made["steps"] = []
+    for number, gateway in enumerate(("gw1", "gw2")):
+        t = 3.0 + 4 * number
+        when = rng.choice(("HandoverState sent", "HandoverState got", "Up unsent", "Up got"))
+        made["steps"] += [fault(t, "restart", target=gateway), fault(t, "kill", target=f"{gateway}+", when=when)]
+    made["steps"].append(fault(12.0, "kill", target="owner") | {"for": 30.0})
+    made["steps"] += [drive(22.0, who) for who in ("op1", "op2")]
+
+
 OF_TWO_GATEWAYS: tuple[Callable[[random.Random, Made], None], ...] = (
     _rival_gone,
     _owner_without_robot,
@@ -123,4 +135,5 @@ OF_TWO_GATEWAYS: tuple[Callable[[random.Random, Made], None], ...] = (
     _silent_to_the_owner,
     _two_latches,
     _undone_restart,
+    _failed_restarts_and_owner_gone,
 )

@@ -41,6 +41,8 @@ class StopRules:
         self._put: defaultdict[str, dict[bytes, float]] = defaultdict(dict)
         """By program, the ids of the stops that it sent this robot, and when first."""
         self._received: set[bytes] = set()
+        self.told: set[bytes] = set()
+        """The ids of those whose programs were told that they are done."""
         self._stopped_at: dict[str, float] = {}
         """By gateway, when it wrote a stop last."""
         self._moved: dict[str, Command] = {}
@@ -80,6 +82,7 @@ class StopRules:
         """What a program is told to be done, was done: a gateway of the robot received the stop."""
         sent = {stop_id for stop_id, at in self._put[who].items() if self._world.now - at < ASKED_S}
         self._checker.counts[f"{what} confirmed"] += 1
+        self.told |= sent
         if sent and not sent & self._received:
             self._checker.violate("confirmed", f"{who} was told that its {what} was done, which no gateway received")
         if max(self._apart_since.values(), default=math.inf) < self._world.now - SHOWN_S:

@@ -298,4 +298,26 @@ FOUND = (
         "        return bool(self.value)\n",
         "        return self.value > 0\n",
     ),
+    _mutant(
+        "a latch is confirmed before it is on disk",
+        "zbridge/client/stops.py",
+        "    control = await _shown(bus, keys, stop, lambda control: stop.id in control.stops, CONFIRM_S)\n",
+        "\n"
+        "    def taken(control: Control) -> bool:\n"
+        "        return stop.id in control.stops or any(latch.id == stop.id for latch in control.latches)\n"
+        "\n"
+        "    control = await _shown(bus, keys, stop, taken, CONFIRM_S)\n",
+    ),
+    _mutant(
+        "a restart that failed ends the watch for others",
+        "zbridge/app/handover/restarts.py",
+        "        self._ownership.hands_over = self._withdrawn = False\n",
+        "        self._withdrawn = False\n",
+    ),
+    _mutant(
+        "an unplugged controller keeps the robot for seconds",
+        "gateways/wc2ec/hq.py",
+        "            if client.silent_s > self.deadman_s - ATTEND_S:\n",
+        "            if client.silent_s > self.deadman_s / ATTEND_S:\n",
+    ),
 )

@@ -153,6 +153,12 @@ def test_a_pose_is_a_pose_an_odometry_and_a_frame() -> None:
     assert (moved.transform.rotation.z, moved.transform.rotation.w) == pytest.approx((half, half))
 
 
+@pytest.mark.parametrize("unknown", ["x", "y", "heading"])
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_pose_with_a_part_that_is_no_number_makes_nothing(unknown: str, value: float) -> None:
+    assert made(robot(), replace(Pose(1.0, -2.0, 0.5), **{unknown: value})) == {}
+
+
 def test_what_nobody_measured_has_a_variance_that_says_so() -> None:
     odom = made(robot(), Pose(0.0, 0.0, 0.0))["odom"]
     assert np.diag(odom.twist.covariance.reshape(6, 6)).tolist() == [1e6] * 6

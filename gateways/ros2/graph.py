@@ -7,7 +7,8 @@ import msgspec
 from gateways.ros2.messages import RECEIVED, TRANSIENT_LOCAL, TWIST, TWIST_STAMPED, Received, TwistCommand
 from gateways.ros2.options import RosOptions
 from zbridge.protocol import ProtocolError
-from zbridge.ros2 import NO_HASH, Endpoint, Kind, Types, endpoints_of, read_token
+from zbridge.ros2.rmw_zenoh import Endpoint, Kind, endpoints_of, read_token
+from zbridge.ros2.types import NO_HASH, Types
 
 ENDPOINTS = 64
 """Most known publishers of the robot, subscribers to its commands, and other drivers, each; the rest is ignored."""

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from zbridge.protocol import KeyedSample
-from zbridge.ros2 import Types
+from zbridge.ros2.types import Types
 
 TWIST, TWIST_STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 _NS_PER_S = 1_000_000_000

@@ -7,7 +7,8 @@ from typing import Annotated
 import msgspec
 
 from zbridge.protocol import ConfigError, Positive
-from zbridge.ros2 import DISTROS, is_ros_name
+from zbridge.ros2.rmw_zenoh import is_ros_name
+from zbridge.ros2.types import DISTROS
 
 TOPICS = ("scan", "odom", "map", "imu", "battery_state", "image")
 """The options that name topics which the robot publishes."""

@@ -36,7 +36,8 @@ from zbridge.protocol import (
     subscription,
     write_sample,
 )
-from zbridge.ros2 import KEEP_LAST_10, LATCHED, SENSOR_DATA, Attachment, Endpoint, Kind, Node, Types, read_attachment
+from zbridge.ros2.rmw_zenoh import KEEP_LAST_10, LATCHED, SENSOR_DATA, Attachment, Endpoint, Kind, Node, read_attachment
+from zbridge.ros2.types import Types
 
 HANDSHAKE_S = 60.0
 """Seconds after which the link is opened anew where nothing of the robot was received."""

@@ -35,19 +35,8 @@ from zbridge.protocol import (
     subscription,
     write_sample,
 )
-from zbridge.ros2 import (
-    DISTROS,
-    KEEP_LAST_10,
-    LATCHED,
-    SENSOR_DATA,
-    Attachment,
-    Endpoint,
-    Kind,
-    Node,
-    Types,
-    read_attachment,
-    types_of,
-)
+from zbridge.ros2.rmw_zenoh import KEEP_LAST_10, LATCHED, SENSOR_DATA, Attachment, Endpoint, Kind, Node, read_attachment
+from zbridge.ros2.types import DISTROS, Types, types_of
 from zbridge.simulation.simulator import STEP_S, live
 from zbridge.simulation.world import Body, Grid, cast
 from zbridge.transport import Conversation, ConversationHooks

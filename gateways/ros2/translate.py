@@ -38,7 +38,7 @@ from zbridge.protocol import (
     Translate,
     Unsupported,
 )
-from zbridge.ros2 import types_of
+from zbridge.ros2.types import types_of
 
 NAME = "ros2"
 OLDEST_NS = 1_000_000_000

@@ -7,7 +7,7 @@ import struct
 import pytest
 
 from zbridge.errors import ProtocolError
-from zbridge.ros2 import (
+from zbridge.ros2.rmw_zenoh import (
     KEEP_LAST_10,
     LATCHED,
     SENSOR_DATA,
@@ -21,13 +21,15 @@ from zbridge.ros2 import (
     all_tokens,
     dds_type,
     endpoints_of,
+    gid_of,
     is_ros_name,
+    read_attachment,
+    read_qos,
     read_token,
     ros_name,
     ros_type,
     topic_key,
 )
-from zbridge.ros2.rmw_zenoh import gid_of, read_attachment, read_qos
 
 STRING = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 ADD = "RIHS01_e118de6bf5eeb66a2491b5bda11202e7b68f198d6f67922cf30364858239c81a"

@@ -10,7 +10,7 @@ import pytest
 from rosbags.typesys import Stores
 
 from zbridge.errors import ConfigError, EncodeError, ProtocolError
-from zbridge.ros2 import DISTROS, NO_HASH, types_of
+from zbridge.ros2.types import DISTROS, NO_HASH, types_of
 
 HASHES = {  # of running ROS 2 systems: `ros2 topic info -v`, the design page of rmw_zenoh, REP 2011's example
     "std_msgs/msg/String": "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from zbridge.errors import Malformed, Unsupported
 from zbridge.fleet.messages import Drive
 from zbridge.protocol.kinematics import within_full_scale
-from zbridge.ros2 import Types
+from zbridge.ros2.types import Types
 from zbridge.views.ros2.settings import RobotBody
 
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"

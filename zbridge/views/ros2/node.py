@@ -13,7 +13,7 @@ from zbridge.client import Fleet
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Devices, FleetMessage
 from zbridge.fleet.topics import KeySpace, Topic, is_concrete
-from zbridge.ros2 import LATCHED, Kind
+from zbridge.ros2.rmw_zenoh import LATCHED, Kind
 from zbridge.views.live_robots import OnDemandSubscriptions, read_payload
 from zbridge.views.ros2.outlets import Outlet, RosSide
 from zbridge.views.ros2.pictures import TOPICS, RosPictures, RosTopic

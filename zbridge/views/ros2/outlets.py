@@ -11,7 +11,8 @@ from typing import Any
 from zbridge.bus import Bus, Handle
 from zbridge.errors import EncodeError
 from zbridge.metrics import Metrics
-from zbridge.ros2 import Attachment, Endpoint, Kind, Node, Reliability, RosQoS, Types
+from zbridge.ros2.rmw_zenoh import Attachment, Endpoint, Kind, Node, Reliability, RosQoS
+from zbridge.ros2.types import Types
 
 
 class RosSide:

@@ -25,7 +25,8 @@ from zbridge.fleet.messages import (
 from zbridge.fleet.payload import measured_ns
 from zbridge.metrics import Metrics
 from zbridge.protocol.odometry import Odometry
-from zbridge.ros2 import KEEP_LAST_10, LATCHED, SENSOR_DATA, RosQoS, Types, ros_name
+from zbridge.ros2.rmw_zenoh import KEEP_LAST_10, LATCHED, SENSOR_DATA, RosQoS, ros_name
+from zbridge.ros2.types import Types
 from zbridge.views.ros2.diagnostics import Diagnostic, entries_of
 from zbridge.views.ros2.settings import RobotBody
 from zbridge.views.ros2.shapes import Frames, Shapes, Speeds, header, speeds_of, urdf

@@ -10,7 +10,7 @@ from typing import Any
 from zbridge.bus import Handle, IncomingQuery
 from zbridge.client import Robot
 from zbridge.errors import BusError, Malformed, NotReady, ProtocolError, Refused, describe
-from zbridge.ros2 import SERVICES, Attachment, Kind, Node, read_attachment
+from zbridge.ros2.rmw_zenoh import SERVICES, Attachment, Kind, Node, read_attachment
 from zbridge.tasks import Tasks
 from zbridge.views.ros2.outlets import RosSide
 

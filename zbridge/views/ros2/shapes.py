@@ -17,7 +17,8 @@ import msgspec
 import numpy as np
 
 from zbridge.fleet.messages import Battery, Image, Map, Motion, Pose, Reading, Scan, Scanner
-from zbridge.ros2 import Types, ros_name
+from zbridge.ros2.rmw_zenoh import ros_name
+from zbridge.ros2.types import Types
 from zbridge.views.ros2.settings import RobotBody
 
 POSITION_VARIANCE = 0.05**2

@@ -22,7 +22,7 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import Control, Drive
 from zbridge.lease.stick import Stick
 from zbridge.protocol.rate_limit import RateLimit
-from zbridge.ros2 import KEEP_LAST_10, Endpoint, Kind, Node, endpoints_of, read_attachment, read_token
+from zbridge.ros2.rmw_zenoh import KEEP_LAST_10, Endpoint, Kind, Node, endpoints_of, read_attachment, read_token
 from zbridge.views.ros2.cmd_vel import MOST_BYTES, read_twist
 from zbridge.views.ros2.diagnostics import MOST_VALUES, OK, WARN, Diagnostic, cut
 from zbridge.views.ros2.driving import DEADMAN_S, PUBLISHERS, QUIET_S, RULES, Driving

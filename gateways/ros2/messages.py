@@ -94,10 +94,7 @@ STOPPED = Velocity()
 
 def write_twist(types: Types, type_name: str, velocity: Velocity) -> bytes:
     """Write a velocity as CDR of one of the two types; the stamp of a TwistStamped is zero."""
-    linear = types.message("geometry_msgs/msg/Vector3", x=velocity.forward, y=velocity.left)
-    angular = types.message("geometry_msgs/msg/Vector3", z=velocity.turn)
-    twist = types.message(TWIST, linear=linear, angular=angular)
+    twist = {"linear": {"x": velocity.forward, "y": velocity.left}, "angular": {"z": velocity.turn}}
     if type_name == TWIST_STAMPED:
-        header = types.message("std_msgs/msg/Header", frame_id="base_link")
-        twist = types.message(TWIST_STAMPED, header=header, twist=twist)
-    return types.encode(twist)
+        return types.encode(types.message(TWIST_STAMPED, header={"frame_id": "base_link"}, twist=twist))
+    return types.encode(types.message(TWIST, **twist))

@@ -188,8 +188,7 @@ class RosPictures:
             }
             for entry in (*entries_of(self.robot, self._status, self._control), *more)
         ]
-        fields = {"header": header(now_ns, ""), "status": status}
-        return self._types.nested("diagnostic_msgs/msg/DiagnosticArray", fields)
+        return self._types.message("diagnostic_msgs/msg/DiagnosticArray", header=header(now_ns, ""), status=status)
 
     def _on_scan(self, path: str, scan: Scan, stamp_ns: int, wanted: Container[str]) -> Made:
         before, self._scan_at_ns = self._scan_at_ns, stamp_ns

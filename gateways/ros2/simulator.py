@@ -7,7 +7,6 @@ when no command came for :data:`TIMEOUT_S`.
 from __future__ import annotations
 
 import asyncio
-import logging
 import math
 import random
 import socket
@@ -41,8 +40,6 @@ from zbridge.simulation.simulator import STEP_S, live
 from zbridge.simulation.world import Body, Grid, cast
 from zbridge.transport import Conversation, ConversationHooks
 from zbridge.transport.samples import serve
-
-log = logging.getLogger("gateways.ros2.simulator")
 
 TIMEOUT_S = 0.5
 """Seconds after which a command counts no more (``cmd_vel_timeout`` of ros2_controllers)."""

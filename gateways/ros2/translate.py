@@ -40,7 +40,6 @@ from zbridge.protocol import (
 )
 from zbridge.ros2.types import types_of
 
-NAME = "ros2"
 OLDEST_NS = 1_000_000_000
 """A stamp is believed if it is at most this much before its arrival."""
 AHEAD_NS = 100_000_000

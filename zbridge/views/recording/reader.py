@@ -25,8 +25,6 @@ RECORD_BYTES = 64 * 2**20
 """Longest record that is read."""
 CHUNK_BYTES = 256 * 2**20
 """Largest chunk, uncompressed."""
-CHANNELS = 65_536
-"""As many as there are ids."""
 TEXT_BYTES = 1024
 """Longest topic, and longest name of a schema or of an encoding."""
 SCHEMA_BYTES = 2**20

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
@@ -20,8 +19,6 @@ from zbridge.fleet.topics import KeySpace
 from zbridge.protocol.address import Address
 from zbridge.views.recording.reader import RecordingReader, open_recording
 from zbridge.views.recording.wire_tape import WireStep, steps
-
-log = logging.getLogger("zbridge.views.recording")
 
 ANSWER_S = 2.0
 """Longest time that a frame of the handshake waits for the gateway; then no other one of the conversation waits."""

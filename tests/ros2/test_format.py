@@ -12,13 +12,10 @@ from zbridge.ros2.rmw_zenoh import (
     LATCHED,
     SENSOR_DATA,
     Attachment,
-    Durability,
     Endpoint,
     Kind,
     Node,
-    Reliability,
     RosQoS,
-    all_tokens,
     dds_type,
     endpoints_of,
     gid_of,
@@ -85,7 +82,7 @@ QOS = {
     ":1:,1:,:,:,,": LATCHED,
     "2::,5:,:,:,,": SENSOR_DATA,
     "::,:,:,:,,": RosQoS(depth=42),
-    "2:1:2,:,:,:,,": RosQoS(Reliability.BEST_EFFORT, Durability.TRANSIENT_LOCAL, 0),
+    "2:1:2,:,:,:,,": RosQoS(best_effort=True, transient_local=True, depth=0),
 }
 NAMES = {"r1": "r1", "front left": "front_left", "7": "_7", "": "_", "a-b.c": "a_b_c", "Ä": "_"}
 
@@ -181,16 +178,11 @@ def test_tokens_of_a_topic_are_asked_for_by_its_name() -> None:
     assert endpoints_of(3, Kind.PUBLISHER, "/r1/scan") == "@ros2_lv/3/*/*/*/MP/*/*/*/%r1%scan/*/*/*"
 
 
-def test_all_tokens_of_a_domain_or_of_a_kind_are_asked_for() -> None:
-    assert all_tokens(3) == "@ros2_lv/3/**"
-    assert endpoints_of(3, Kind.SERVER) == "@ros2_lv/3/*/*/*/SS/*/*/*/*/*/*/*"
-
-
 FOREIGN_QOS = {  # other numbers of rmw's policies, as rmw_zenoh may write them
     "1:2:1,7:,:,:,,": RosQoS(depth=7),
     "0:0:0,:,:,:,,": RosQoS(depth=42),
     "3:3:3,1:,:,:,,": RosQoS(depth=1),
-    "2:1:2,9:,:,:,,": RosQoS(Reliability.BEST_EFFORT, Durability.TRANSIENT_LOCAL, 0),
+    "2:1:2,9:,:,:,,": RosQoS(best_effort=True, transient_local=True, depth=0),
     "::,10:,:,:,,:more": KEEP_LAST_10,
     "4::,10:,:,:,,": None,
     ":4:,10:,:,:,,": None,

@@ -21,6 +21,8 @@ _SERVICES: Mapping[str, tuple[str, str]] = {
     "example_interfaces/srv/AddTwoInts": ("int64 a\nint64 b", "int64 sum"),
 }
 """The definitions of services: rosbags knows messages only."""
+_EVENT_INFO = "uint8 event_type\nbuiltin_interfaces/Time stamp\nuint8[16] client_gid\nint64 sequence_number"
+"""``service_msgs/msg/ServiceEventInfo`` as ROS hashes it: what .msg files call char is uint8."""
 
 _Plan = tuple[Any, dict[str, Any], dict[str, tuple[str, str | None]]]
 """A type's class, its zeros by attribute, and by field: its attribute, and the type of its parts if it has any."""
@@ -142,29 +144,17 @@ def _add_service(store: Any, service: str) -> None:
     from rosbags.interfaces import Nodetype
     from rosbags.typesys import get_types_from_msg
 
-    request, response = f"{service}_Request", f"{service}_Response"
+    request, response, event = f"{service}_Request", f"{service}_Response", f"{service}_Event"
     for name, definition in zip((request, response), _SERVICES[service], strict=True):
         ((_, parsed),) = get_types_from_msg(definition or "uint8 structure_needs_at_least_one_member", name).items()
         store.register({name: parsed})
     info = "service_msgs/msg/ServiceEventInfo"
-    number = (Nodetype.BASE, ("uint8", 0))
-    store.fielddefs[info] = (
-        [],
-        [  # as ROS hashes it: what .msg files call char is uint8
-            ("event_type", number),
-            ("stamp", (Nodetype.NAME, "builtin_interfaces/msg/Time")),
-            ("client_gid", (Nodetype.ARRAY, (number, 16))),
-            ("sequence_number", (Nodetype.BASE, ("int64", 0))),
-        ],
-    )
-    event: list[Any] = [("info", (Nodetype.NAME, info))]
-    event += [
-        (field, (Nodetype.SEQUENCE, ((Nodetype.NAME, name), 1)))
-        for field, name in (("request", request), ("response", response))
-    ]
-    whole = (("request_message", request), ("response_message", response), ("event_message", f"{service}_Event"))
-    store.fielddefs[f"{service}_Event"] = ([], event)
-    store.fielddefs[service] = ([], [(field, (Nodetype.NAME, name)) for field, name in whole])
+    store.fielddefs |= get_types_from_msg(_EVENT_INFO, info)
+    parts = (("request", request), ("response", response))
+    lists = [(field, (Nodetype.SEQUENCE, ((Nodetype.NAME, name), 1))) for field, name in parts]
+    store.fielddefs[event] = ([], [("info", (Nodetype.NAME, info)), *lists])
+    messages = [(f"{field}_message", (Nodetype.NAME, name)) for field, name in (*parts, ("event", event))]
+    store.fielddefs[service] = ([], messages)
 
 
 _ZEROS: Mapping[str, Any] = {"string": "", "bool": False, "float32": 0.0, "float64": 0.0}

@@ -100,9 +100,7 @@ def advertise_services(services: Iterable[Service]) -> str:
     """Offer services."""
     entries = [
         {
-            "id": service.id,
-            "name": service.name,
-            "type": service.type,
+            **msgspec.structs.asdict(service),
             "request": _json_schema(f"{service.type}Request", service.request),
             "response": _json_schema(f"{service.type}Response", service.response),
         }

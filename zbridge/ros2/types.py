@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from functools import lru_cache
+from collections.abc import Callable, Mapping
+from functools import cache, lru_cache
 from typing import Any
 
 from zbridge.errors import ConfigError, EncodeError, ProtocolError
@@ -34,7 +34,8 @@ class Types:
     def __init__(self, distro: str, store: Any) -> None:
         self.distro = distro
         self._store = store
-        self._hashes: dict[str, str] = {}
+        self.computed_hash: Callable[[str], str] = cache(store.hash_rihs01)
+        """Returns the hash of a type of a message or service; raises KeyError for an unknown type."""
         self._made: dict[str, _Plan] = {}
         for service in _SERVICES:
             _add_service(store, service)
@@ -45,12 +46,6 @@ class Types:
     def hash(self, type_name: str) -> str:
         """Return the hash of a type as it stands in keys: ``RIHS01_...``; for humble :data:`NO_HASH`. Or KeyError."""
         return NO_HASH if self.distro == "humble" else self.computed_hash(type_name)
-
-    def computed_hash(self, type_name: str) -> str:
-        """Return the hash of a type of a message or service; raise KeyError for an unknown type."""
-        if type_name not in self._hashes:
-            self._hashes[type_name] = self._store.hash_rihs01(type_name)
-        return self._hashes[type_name]
 
     def __contains__(self, type_name: str) -> bool:
         return type_name in self._store.types

@@ -178,8 +178,7 @@ class Recorder:
     # One message
 
     def _write(self, arrival: Arrival) -> None:
-        known = self._tracks.get((arrival.key, arrival.attachment == topics.WIRE_DATAGRAM))
-        track = known or self._track(arrival.key, arrival.attachment)
+        track = self._track(arrival.key, arrival.attachment)
         self.messages += 1
         publish_ns = self._write_own(track, arrival)
         topic = track.topic

@@ -17,7 +17,7 @@ _NS_PER_S = 1_000_000_000
 
 
 class LinkEvent(msgspec.Struct, frozen=True):
-    """News of the link: it is open, a token appeared or is gone, samples were dropped."""
+    """News of the link: it is open, a token appeared or is gone, samples were dropped, one of our own came back."""
 
     sample: KeyedSample
 
@@ -60,10 +60,6 @@ class CompressedImage(Received, frozen=True):
 
 class TwistCommand(Received, frozen=True):
     """What another node wrote to the topic of commands: geometry_msgs/msg/Twist or TwistStamped."""
-
-
-class Ignored(msgspec.Struct, frozen=True):
-    """A sample of our own that came back."""
 
 
 RECEIVED: dict[str, tuple[type[Received], str]] = {

@@ -102,11 +102,8 @@ class NodeRole(Session[Any]):
                 node, number, Kind.PUBLISHER, f"{prefix}/{name}", type_name, types.hash(type_name), qos
             )
         self.send_first(subscription(subscriber.key))
-        for token in (
-            node.token(),
-            subscriber.token(),
-            *(publisher.token() for publisher in self._publishers.values()),
-        ):
+        endpoints = (subscriber, *self._publishers.values())
+        for token in (node.token(), *(endpoint.token() for endpoint in endpoints)):
             self.send_first(KeyedSample(SampleKind.ANNOUNCE, token))
 
     def publish(self, name: str, message: Any) -> None:

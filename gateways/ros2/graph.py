@@ -30,11 +30,10 @@ class Graph:
         self._domain = options.domain
         self._types = types
         self.command_topic = options.topic("cmd_vel")
-        topics = ((option, options.topic(option)) for option in RECEIVED)
         self._wanted = {
-            name: Wanted(name, RECEIVED[option][0], (RECEIVED[option][1],), option in TRANSIENT_LOCAL)
-            for option, name in topics
-            if name is not None
+            name: Wanted(name, received, (type_name,), option in TRANSIENT_LOCAL)
+            for option, (received, type_name) in RECEIVED.items()
+            if (name := options.topic(option)) is not None
         }
         self._command = Wanted(self.command_topic or "", TwistCommand, (TWIST, TWIST_STAMPED), latched=False)
         self.own_zid: str | None = None

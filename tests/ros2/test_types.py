@@ -99,9 +99,10 @@ def test_a_value_that_does_not_fit_is_an_error_of_ours() -> None:
 def test_random_bytes_give_a_message_or_a_protocol_error() -> None:
     types, dice = types_of("jazzy"), random.Random(18)
     for name in (*PINNED, "std_srvs/srv/SetBool_Request"):
-        if name not in types:
+        try:
+            good = types.encode(types.message(name))
+        except KeyError:  # a service
             continue
-        good = types.encode(types.message(name))
         for _ in range(150):
             payload = bytearray(dice.choice((good, b"\x00\x01\x00\x00" + dice.randbytes(dice.randrange(200)))))
             for _ in range(dice.randrange(4)):

@@ -47,9 +47,6 @@ class Types:
         """Return the hash of a type as it stands in keys: ``RIHS01_...``; for humble :data:`NO_HASH`. Or KeyError."""
         return NO_HASH if self.distro == "humble" else self.computed_hash(type_name)
 
-    def __contains__(self, type_name: str) -> bool:
-        return type_name in self._store.types
-
     def message(self, type_name: str, /, **fields: Any) -> Any:
         """Make a message; a field that is left out is zero, empty or a message of such.
 

@@ -128,14 +128,11 @@ class ReplayedRobot:
 
     def _topic(self, path: str) -> Topic | None:
         """Return the topic of what is published of a path; None for commands, queries and what is not known."""
-        if path in self._topics:
-            return self._topics[path]
-        topic = None if path.startswith("@") else topics.find(path)
-        if topic is None or topic.delivery not in (Delivery.STREAM, Delivery.STATE) or len(self._topics) >= KEYS:
-            topic = None
-        if len(self._topics) < KEYS:
-            self._topics[path] = topic
-        return topic
+        if path not in self._topics and len(self._topics) < KEYS:
+            topic = None if path.startswith("@") else topics.find(path)
+            published = topic is not None and topic.delivery in (Delivery.STREAM, Delivery.STATE)
+            self._topics[path] = topic if published else None
+        return self._topics.get(path)
 
     def _put(self, topic: Topic, payload: bytes) -> None:
         publisher = self._publishers.get(topic.path)

@@ -30,14 +30,7 @@ _READ = 65_536
 class WireLink(asyncio.DatagramProtocol):
     """One link of the robot. report: called with what happens, for people."""
 
-    def __init__(
-        self,
-        path: Path,
-        keys: KeySpace,
-        link: str,
-        speed: float = 1.0,
-        report: Callable[[str], object] = lambda _: None,
-    ) -> None:
+    def __init__(self, path: Path, keys: KeySpace, link: str, speed: float, report: Callable[[str], object]) -> None:
         self.link = link
         self.frames = 0
         self.unanswered = 0

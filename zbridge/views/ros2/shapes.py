@@ -357,6 +357,4 @@ def _is_finite(pose: Pose) -> bool:
 
 
 def _first(value: float) -> Any:
-    covariance = np.zeros(9)
-    covariance[0] = value
-    return covariance
+    return np.array((value, *(0.0,) * 8))

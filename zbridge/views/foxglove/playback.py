@@ -127,12 +127,12 @@ class IndexedRecording:
 
     def _read_through(self) -> None:
         """Read everything up to the cut, for channels and times."""
-        begin_ns, end_ns = _LAST_NS, 0
+        self.begin_ns = _LAST_NS
         with self.path.open("rb") as file:
             for schema, channel, message in self._until_fault(file):
                 self._add(channel, schema)
-                begin_ns, end_ns = min(begin_ns, message.log_time), max(end_ns, message.log_time)
-        self.begin_ns, self.end_ns = begin_ns, end_ns
+                self.begin_ns = min(self.begin_ns, message.log_time)
+                self.end_ns = max(self.end_ns, message.log_time)
 
     def _add(self, channel: Any, schema: Any) -> None:
         encoding = channel.message_encoding

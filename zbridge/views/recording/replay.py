@@ -190,21 +190,17 @@ class Replay:
 
     # The player's thread
 
-    def _skip(self, message: RecordedMessage) -> None:
-        """Keep the last state of each key from before the selected part: who comes later knows it, too."""
+    def _play(self, message: RecordedMessage, selected: bool) -> None:
+        """Play a message; keep the last state of each key from before the selected part, and play these first."""
+        if selected:
+            earlier, self._earlier = self._earlier, {}
+            for each in (*earlier.values(), message):
+                self._play_now(each)
+            return
         split = split_key(message.channel.topic)
         topic = topics.find(split[2]) if split is not None else None
         if topic is not None and topic.delivery is Delivery.STATE and len(self._earlier) < KEYS:
             self._earlier[message.channel.topic] = message
-
-    def _play(self, message: RecordedMessage, selected: bool) -> None:
-        if not selected:
-            self._skip(message)
-            return
-        earlier, self._earlier = self._earlier, {}
-        for state in earlier.values():
-            self._play_now(state)
-        self._play_now(message)
 
     def _play_now(self, message: RecordedMessage) -> None:
         topic = message.channel.topic
@@ -235,11 +231,8 @@ class Replay:
         keys = KeySpace(self._plan.realm, self._plan.names[recorded])
         bus = AsRecorded(self._bus, self.robots[recorded])
         robot = RobotSubscription(cast("Bus", bus), keys, metrics)
-
-        def answer(query: Any) -> None:
-            query.answer(payloads.encode(Sessions(sessions.snapshots())))
-
-        shown = self._bus.answer(keys.key(topics.RPC_SESSIONS("gateway").path), answer)
+        key = keys.key(topics.RPC_SESSIONS("gateway").path)
+        shown = self._bus.answer(key, lambda query: query.answer(payloads.encode(Sessions(sessions.snapshots()))))
         listeners = [
             Listener(plan, f"replay-{number}", robot, sessions, metrics)
             for number, plan in enumerate(self._plan.listeners, 1)
@@ -269,13 +262,11 @@ class AsRecorded:
 
     def subscribe(self, key_expr: str, handler: Callable[[Sample], None], **options: Any) -> Handle:
         """Subscribe as :class:`zbridge.bus.Bus` does."""
-
-        def show(sample: Sample) -> None:
-            handler(self._original(sample) if sample.key.endswith(_STATUS) else sample)
-
-        return self._bus.subscribe(key_expr, show, **options)
+        return self._bus.subscribe(key_expr, lambda sample: handler(self._original(sample)), **options)
 
     def _original(self, sample: Sample) -> Sample:
+        if not sample.key.endswith(_STATUS):
+            return sample
         try:
             status = payloads.decode(Status, sample.payload)
         except PayloadError:

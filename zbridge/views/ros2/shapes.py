@@ -164,9 +164,8 @@ class Shapes:
         """Write an Odometry. pose: in the frame odom, None: unknown; spread: its variances are so many times larger."""
         if pose is not None and not _is_finite(pose):
             return None
-        position, heading = (UNMEASURED, UNMEASURED)
-        if pose is not None:
-            position, heading = POSITION_VARIANCE * spread, HEADING_VARIANCE * spread
+        position = UNMEASURED if pose is None else POSITION_VARIANCE * spread
+        heading = UNMEASURED if pose is None else HEADING_VARIANCE * spread
         forward = UNMEASURED if speeds.forward_mps is None else SPEED_VARIANCE * speeds.full_mps**2
         turn = UNMEASURED if speeds.turn_radps is None else TURN_VARIANCE
         speed = speeds.forward_mps or 0.0, speeds.turn_radps or 0.0

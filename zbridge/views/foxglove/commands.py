@@ -117,7 +117,9 @@ class RobotCommands(ViewerCommands):
     def _add(self, robot: str, what: str) -> Service:
         number = next(self._ids)
         name = f"/{robot}/{what}" if robot else f"/{what}"
-        service = Service(number, name, f"zbridge/{what.capitalize()}", _ASKED[what], _ANSWERED)
+        kind = f"zbridge/{what.capitalize()}"
+        request = replies.json_schema(f"{kind}Request", _ASKED[what])
+        service = Service(number, name, kind, request, replies.json_schema(f"{kind}Response", _ANSWERED))
         self._services[number] = (robot, what, service)
         return service
 

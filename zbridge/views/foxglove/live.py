@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import msgspec
@@ -125,10 +125,9 @@ class LiveSource(ViewerSource):
         del self._shown[name]
         shown.subscribed.need(set())
 
-    def _offer(self, shown: _Shown, channels: Any) -> None:
-        new = [channel for channel in channels if channel.path not in shown.offered]
-        shown.offered.update((channel.path, channel) for channel in new)
-        self._left_out.value += self.hub.offer(new)
+    def _offer(self, shown: _Shown, channels: Collection[ViewerChannel]) -> None:
+        shown.offered.update((channel.path, channel) for channel in channels)
+        self._left_out.value += self.hub.offer(channels)
 
     def _on_devices(self, sample: Sample) -> None:
         """Offer a channel for each sensor that a robot announces."""

@@ -167,8 +167,7 @@ class Teleop:
         gid = self._tokens.pop(token, None)
         if gid is None:
             return
-        for also in [also for also, known in self._known.items() if known == gid]:
-            del self._known[also]
+        self._known = {also: known for also, known in self._known.items() if known != gid}
         self._limits.pop(gid, None)
         self._driving.gone(gid)
         pilot = self._pilots.pop(gid, None)

@@ -27,6 +27,8 @@ class Command:
     def __init__(self, key: str, payload: bytes, shown: dict[str, Any], who: str, now: float) -> None:
         fields = read(payload)
         self.kind = key.partition("@cmd/")[2].partition("/")[0]
+        self.part = key.partition("@cmd/motor/")[2]
+        """The name of a motor; empty: the whole robot."""
         self.who = who
         self.put_at = self.given_at = now
         """When it was put on the bus, and when its program gave it."""
@@ -77,6 +79,8 @@ class Grant:
         self.last_motion: Command | None = None
         self.last_mode: Command | None = None
         self.needs_neutral = False
+        self.moved: set[str] = set()
+        """Its parts that moved, and had no neutral since; ``""``: the whole robot."""
         self._newest = 0
         """The highest number of its commands that arrived."""
         self.used = False
@@ -121,7 +125,8 @@ class Grant:
             return
         if not command.value:
             if late_s < 0.3 or not command.dated:
-                self.needs_neutral = False
+                self.moved -= {command.part} if command.part else self.moved
+                self.needs_neutral = bool(self.needs_neutral and self.moved)
             self.last_motion, self.autonomous = None, False
             return
         most_s = min(MAX_AGE_S, self.deadman_s)
@@ -137,6 +142,7 @@ class Grant:
             command.forbidden = "neutral first"
         else:
             self.last_motion = command
+            self.moved.add(command.part)
 
 
 def fault_of(command: Command, grant: Grant | None, gateway: str, now: float) -> tuple[str, str] | None:

@@ -20,14 +20,15 @@ from tests.simulated.stops import StopRules
 from tests.simulated.written import Written
 
 if TYPE_CHECKING:
+    from tests.simulated.hq_programs import HqProgram
     from tests.simulated.scenario import Simulation
 
 NEW = "+"
 """Behind the name of a gateway's successor, until *go*."""
 WRITTEN_S = 0.02
 """Seconds that writing a latched stop takes."""
-KNOWN_S = 8.0
-"""Two gateways that see each other for so long know the same latched stops."""
+KNOWN_S = 1.5
+"""Longest time until a gateway that has met the other one knows its latched stops: it asks every 0.5 s."""
 MEET_S = 3.0
 """Two gateways that see each other for so long: exactly one grants."""
 LOOK_S = 0.6
@@ -72,6 +73,7 @@ class Checker:
         self._taken_at: dict[str, float] = {}
         """By the name of a holder, when a stop or a takeover ended its lease."""
         self._wrote_motion: dict[str, float] = {}
+        self._paused_at: dict[str, float] = {}
         self._met: dict[frozenset[str], float] = {}
         self._handlers = {
             "asks": self._on_asks,
@@ -88,6 +90,8 @@ class Checker:
             "killed": self._on_ended,
             "ended": self._on_ended,
             "was suspended": self._on_suspended,
+            "paused": self._on_paused,
+            "resumed": self._on_resumed,
             "gives": self._on_gives,
             "crashed": lambda who, why: self.violate("fragile", f"{who} crashed: {why}"),
         }
@@ -131,9 +135,10 @@ class Checker:
             stop_id = request.get("id", b"")
             self._unlatched[stop_id].add(gateway)
             self._released_at.setdefault(stop_id, self.world.now)
-            for name, known in self.latches.items():
-                if known.pop(stop_id, None) is not None and name != gateway:
-                    self.uncertain.add(stop_id)  # that gateway has still to learn of it
+            for known in self.latches.values():
+                known.pop(stop_id, None)
+            if len(self.latches) > 1:
+                self.uncertain.add(stop_id)  # another gateway may still have to learn of it
         elif answer.get("ok") and verb in ("acquire", "takeover"):
             grant, last = Grant(gateway, asker, answer, request, self.world.now), self.current.get(gateway)
             stands = last is not None and last.ended_at is None and last.shown and not last.expires_by(self.world.now)
@@ -218,6 +223,15 @@ class Checker:
                 self.counts["excused: killed before a latch was written"] += 1
             self.end(who, "gateway ended")
 
+    def _on_paused(self, who: str) -> None:
+        self._paused_at[who] = self.world.now
+
+    def _on_resumed(self, who: str) -> None:
+        """A restart that was asked for in a pause ends the lease after it."""
+        grant, paused_at = self.current.get(who), self._paused_at.get(who, 0.0)
+        if grant is not None and grant.why == "gateway restarted" and (grant.ended_at or 0.0) >= paused_at:
+            grant.ended_at = self.world.now
+
     def _on_suspended(self, who: str, seconds: float) -> None:
         if seconds > 0.15:
             self.end(who, "suspended")
@@ -243,7 +257,7 @@ class Checker:
     def _share_latches(self, one: str, other: str) -> None:
         """Two gateways of one robot that met for long know of each other's latches."""
         now = self.world.now
-        if self._met_for(one, other) < KNOWN_S:
+        if self._met_for(one, other) < MEET_S:
             return
         for here, there in ((one, other), (other, one)):
             for stop_id, at in self.latches[here].items():
@@ -251,9 +265,9 @@ class Checker:
                     self.latches[there].setdefault(stop_id, now)
 
     def _share_releases(self, pair: frozenset[str]) -> None:
-        """Two gateways of one robot that met since a latched stop was released both know that."""
+        """A gateway that met the one that serves the robot, and has released a latched stop, knows that."""
         for stop_id, names in self._unlatched.items():
-            if names & pair and self.world.now - self._released_at[stop_id] > MEET_S:
+            if any(map(self.obligations.serves, names & pair)) and self.world.now - self._released_at[stop_id] > MEET_S:
                 self.uncertain.discard(stop_id)
 
     def _met_for(self, one: str, other: str) -> float:
@@ -278,26 +292,32 @@ class Checker:
 
     def _of_program(self, listener: str, command: Command) -> None:
         """A listener's motion was said by an HQ program a moment ago."""
-        now = self.world.now
-        for program in self.simulation.programs:
-            most_s = HQ_DEADMAN_S[program.protocol] + 0.35
-            if program.options.get("once") and self.released.holds(program, command.value, most_s):
-                return
-            later: float | None = None  # of two wheels one may have the next value
-            for at, value in reversed(self._gives[program.name]):
-                if now - at > most_s:
-                    break
-                other = later if later is not None and program.protocol == "wc2ec" else value
-                later = value
-                if min(value, other) - 0.0052 < command.value < max(value, other) + 0.0052:
-                    self.released.put(program.name, list(self._gives[program.name]))
-                    if program.protocol == "tcpudp":  # one value a command
-                        self.released.put_late(listener, program.name, at, list(self._gives[program.name]))
-                    return
-        if self.released.waited(command.value, self._gives):
+        programs = self.simulation.programs
+        said = {each.name: at for each in programs if (at := self._said(each, command.value)) is not None}
+        if not said and self.released.waited(command.value, self._gives):
             self.counts["excused: pushed during a cut, from the centre"] += 1
-            return
-        self.violate("hq-motion", f"{listener} put {command}, which no HQ program said lately")
+        elif not said:
+            self.violate("hq-motion", f"{listener} put {command}, which no HQ program said lately")
+        elif len(said) == 1:
+            ((program, at),) = said.items()
+            self.released.put(program, list(self._gives[program]))
+            if any(each.name == program and each.protocol == "tcpudp" for each in programs):  # one value a command
+                self.released.put_late(listener, program, at, list(self._gives[program]))
+
+    def _said(self, program: HqProgram, motion: float) -> float | None:
+        """Return when a program said this motion, within its deadman; None if it did not."""
+        now, most_s = self.world.now, HQ_DEADMAN_S[program.protocol] + 0.35
+        if program.options.get("once") and self.released.holds(program, motion, most_s):
+            return now
+        later: float | None = None  # of two wheels one may have the next value
+        for at, value in reversed(self._gives[program.name]):
+            if now - at > most_s:
+                break
+            other = later if later is not None and program.protocol == "wc2ec" else value
+            later = value
+            if min(value, other) - 0.0052 < motion < max(value, other) + 0.0052:
+                return at
+        return None
 
     def wrote_motion_at(self, gateway: str) -> float:
         """Return when a gateway wrote motion last."""

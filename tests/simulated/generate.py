@@ -23,15 +23,15 @@ _DRIVEN = ("moving", "moving", "mode read", "drive received", "stopping", "stop 
 
 
 def scenario(seed: int, profile: str | None = None) -> dict[str, Any]:
-    """Make the scenario of a seed; profile None: a situation and another profile by turns.
+    """Make the scenario of a seed; profile None: three situations, then one of another profile.
 
-    One seed after the other meets each situation, so that a minute has them all.
+    One seed after the other meets each situation, so that a minute has them all, twice.
     """
     rng = random.Random(f"scenario {seed} {profile}")
     turn = seed
     if profile is None:
-        turn, other = divmod(seed, 2)
-        profile = rng.choice(PROFILES[:-1]) if other else PROFILES[-1]
+        turn = seed - seed // 4
+        profile = rng.choice(PROFILES[:-1]) if seed % 4 == 3 else PROFILES[-1]
     stripped = rng.random() < 1 / 3
     protocol = profile if profile in ("alf", "wc2ec") else rng.choice(("tcpudp", "tcpudp", "tcpudp", "alf", "wc2ec"))
     if profile == "tcpudp":

@@ -257,8 +257,9 @@ class WebotsHq(HqProgram):
 
     def send_motion(self, value: float) -> None:
         if self.end is not None:
-            for wheel in tuple(self._wheels.values()):
-                self.end.send(b"\x82" + wheel + struct.pack("<d", value * WHEEL_FULL))
+            for name, wheel in tuple(self._wheels.items()):
+                rests = name == b"left" and self.options.get("one")
+                self.end.send(b"\x82" + wheel + struct.pack("<d", 0.0 if rests else value * WHEEL_FULL))
 
 
 HQ_PROGRAMS = {"tcpudp": TcpUdpHq, "alf": AlfHq, "wc2ec": WebotsHq}

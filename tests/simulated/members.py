@@ -24,6 +24,7 @@ ROBOT = "r1"
 _NOTHING = object()
 GARBLED_STOP = msgpack.packb({"id": bytes(16)}).replace(b"\x81", b"\x82") + b"\xa3who\xa2J\xf6"
 """A stop whose text is Latin-1: whoever sends it must be heard."""
+WHEELS = {"l": "left", "r": "right"}
 WAYS = {
     "forward": ("forward", 1.0),
     "back": ("forward", -1.0),
@@ -308,7 +309,7 @@ class DriverMember(Member):
             lease = next((msgpack.unpackb(each.payload) for each in answers if each.error is None), {})
             if lease.get("ok"):
                 self.note("granted")
-                await self._push_raw(step, lease, dated)
+                await (self._push_wheels if step.get("wheels") else self._push_raw)(step, lease, dated)
                 self.note("released")
         finally:
             self.busy = False
@@ -333,6 +334,21 @@ class DriverMember(Member):
         if step.get("releases", True):
             key = f"fleet/{ROBOT}/@rpc/control/release"
             await bus.ask(key, self._proof(lease, 1, key, b"", dated=False))
+
+    async def _push_wheels(self, step: dict[str, Any], lease: dict[str, Any], dated: bool) -> None:
+        """Push both wheels, fall silent, push on; then let one go only, and push the other one."""
+        number, bus = itertools.count(1), self.bus
+        assert bus is not None
+        for wheels, seconds in (("lr", 1.0), ("", 0.8), ("lr", step["for"]), ("L", 0.1), ("r", 1.0), ("LR", 0.1)):
+            ends_at = asyncio.get_running_loop().time() + seconds
+            while asyncio.get_running_loop().time() < ends_at:
+                for wheel in wheels:
+                    value = self.value() if wheel.islower() else 0.0
+                    self.note("gives", value)
+                    key = f"fleet/{ROBOT}/@cmd/motor/{WHEELS[wheel.lower()]}"
+                    payload = msgpack.packb({"value": value * WHEEL_FULL})
+                    bus.put(key, payload, self._proof(lease, next(number), key, payload, dated), droppable=True)
+                await asyncio.sleep(1 / step["hz"])
 
     def _proof(self, lease: dict[str, Any], number: int, key: str, payload: bytes, dated: bool) -> bytes:
         shown: dict[str, Any] = {"lease": lease["lease"], "seq": number}

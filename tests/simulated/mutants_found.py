@@ -249,4 +249,53 @@ FOUND = (
         '        raise PayloadError(f"{message.__name__}: {error}") from error\n'
         "    return decoded\n",
     ),
+    _mutant(
+        "parts that moved are forgotten when neutral is needed once more",
+        "zbridge/control/commanded_motion.py",
+        "        self.moved |= self.parts\n",
+        "        self.moved = set(self.parts)\n",
+    ),
+    _mutant(
+        "one released latch of two frees the robot",
+        "zbridge/control/authority.py",
+        "            self.machine.events.append(Event(EventKind.UNLATCHED, _ANOTHER_GATEWAY))\n"
+        "        if before and not self.latches:\n"
+        "            self.machine.handle(Input.UNLATCH, Cause())\n",
+        "            self.machine.events.append(Event(EventKind.UNLATCHED, _ANOTHER_GATEWAY))\n"
+        "            self.machine.handle(Input.UNLATCH, Cause())\n",
+    ),
+    _mutant(
+        "a restart that is undone loses the claim",
+        "zbridge/app/handover/restarts.py",
+        "        if self._withdrawn and self._claim is not None:\n"
+        "            self._ownership.restore(self._claim)\n"
+        "        self._ownership.hands_over = self._withdrawn = False\n",
+        "        self._ownership.hands_over = self._withdrawn = False\n"
+        "        if self._withdrawn and self._claim is not None:\n"
+        "            self._ownership.restore(self._claim)\n",
+    ),
+    _mutant(
+        "a refused push is no push",
+        "zbridge/hq/operator.py",
+        "        self._pushed[topic.path] = now\n        self._require_robot()\n        do = intent.motion(now)\n",
+        "        self._require_robot()\n        do = intent.motion(now)\n        self._pushed[topic.path] = now\n",
+    ),
+    _mutant(
+        "who has yielded never serves a robot whose owner cannot",
+        "zbridge/robot/claim.py",
+        "return (self.held_s > 0, not self.leaving, self.healthy, not self.yielded)",
+        "return (self.held_s > 0, not self.leaving, not self.yielded, self.healthy)",
+    ),
+    _mutant(
+        "a stick of ALF at rest turns other robots",
+        "gateways/alf/hq.py",
+        "        if not speed and self.view.protocol != NAME:",
+        "        if False:",
+    ),
+    _mutant(
+        "a motor that runs backward counts as neutral",
+        "zbridge/fleet/messages.py",
+        "        return bool(self.value)\n",
+        "        return self.value > 0\n",
+    ),
 )

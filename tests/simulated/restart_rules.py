@@ -26,6 +26,8 @@ GONE_S = 0.05
 """Seconds after *go* for which what the process before published may still leave."""
 TROUBLE_S = 6.0
 """A fault that is over for so long disturbs no restart."""
+UNDONE_S = 7.0
+"""Seconds after a restart that failed: two looks for other gateways."""
 _FAULTS = ("killed", "paused", "resumed", "cut", "healed", "link lost", "was suspended", "told to end", "crashed")
 _TOLD = {
     "pose": lambda fields: fields["x"] * 100,
@@ -61,7 +63,7 @@ class RestartRules:
     def _watch(self, who: str, what: str, fields: tuple[Any, ...]) -> None:
         name, part = (who[:-1], who[-1]) if who[-1:] in ("+", "-") else (who, "")
         if what in _FAULTS:
-            self._trouble_at = self.world.now
+            self._on_fault(name, part, what)
         elif what == "connected" and who == "robot":
             self._connected[self.simulation.robot.ends[-1]] = self.world.now
             self._moves.clear()
@@ -84,6 +86,11 @@ class RestartRules:
         elif what in ("started", "took nothing over"):
             self._trouble_at = self.world.now if what != "started" or not part else self._trouble_at
             self._given[name] = False
+
+    def _on_fault(self, name: str, part: str, what: str) -> None:
+        if what == "killed" and part == "+":
+            self._on_undone(name)
+        self._trouble_at = self.world.now
 
     def _on_handover(self, name: str, part: str, what: str, said: str) -> None:
         self.checker.counts[f"restart: {said} {what}"] += 1
@@ -183,6 +190,21 @@ class RestartRules:
                 self._judge(name, [end for end in ends if end not in ended], programs)
 
         self.world.after(SOON_S, look)
+
+    def _on_undone(self, name: str) -> None:
+        """A gateway whose successor died keeps the robot, and its connection."""
+        ends, _ = self._hello.pop(name, ([], {}))
+        ends, begun, calm = [end for end in ends if not end.closed], self.world.now, self._untroubled(TROUBLE_S)
+        if not ends or not calm:
+            return
+
+        def look() -> None:
+            if self._trouble_at <= begun + 0.5:  # its link to the router ends with it
+                self.checker.counts["restart: undone"] += 1
+                if any(end.closed or end.broken for end in ends):
+                    self.checker.violate("restart-connection", f"{name} did not restart, and the robot lost it")
+
+        self.world.after(UNDONE_S, look)
 
     def _judge(self, name: str, ends: list[End], programs: dict[str, Any]) -> None:
         self.checker.counts["restart: healthy"] += 1

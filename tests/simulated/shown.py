@@ -44,6 +44,8 @@ class Shown:
         if what == "puts" and who in self._checker.gateways:
             if fields[0].endswith("/status"):
                 status = read(fields[1])
+                if (STALLED in str(status.get("reason"))) is not bool(status.get("stalled")):
+                    self._checker.violate("status", f"{who} shows stalled = {status.get('stalled')}: {status}")
                 if str(status.get("reason")) != self._reason.get(who):
                     self._reason_at[who] = self._world.now
                 self._state[who], self._reason[who] = str(status.get("state")), str(status.get("reason"))

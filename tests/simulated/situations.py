@@ -9,6 +9,7 @@ import random
 from collections.abc import Callable
 
 from tests.simulated.situations_found import FOUND
+from tests.simulated.situations_gateways import OF_TWO_GATEWAYS
 from tests.simulated.steps import Made
 from tests.simulated.steps import drive as _drive
 from tests.simulated.steps import fault as _fault
@@ -260,4 +261,5 @@ SITUATIONS: tuple[Callable[[random.Random, Made], None], ...] = (
     _killed_driver,
     _forged_and_flooded,
     *FOUND,
+    *OF_TWO_GATEWAYS,
 )

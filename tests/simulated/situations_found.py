@@ -5,17 +5,12 @@ from __future__ import annotations
 import random
 from collections.abc import Callable
 
-from tests.simulated.steps import WHEELS, Made, drive, fault, second_gateway, split, stick, tcpudp
-
-
-def _client(made: Made) -> None:
-    """Let the first program be the Python client, which dates its commands and renews its lease."""
-    made["drivers"][0] |= {"options": {}, "router": "router1"}
+from tests.simulated.steps import WHEELS, Made, client, drive, fault, stick, tcpudp
 
 
 def _cut_when_granted(rng: random.Random, made: Made) -> None:
     """A program's link stalls just after it was granted the lease; it drives on, and all of it arrives at once."""
-    _client(made)
+    client(made)
     after = rng.choice((0.0, 0.0, 0.0002, 0.05))
     cut = fault(2.5, "cut", between=["pc1", "router1"], when="granted", after=after)
     made["steps"] = [drive(3.0, "op1", hz=20.0) | {"for": 5.0}, cut | {"for": rng.uniform(0.8, 2.2)}]
@@ -23,7 +18,7 @@ def _cut_when_granted(rng: random.Random, made: Made) -> None:
 
 def _suspended_while_held(rng: random.Random, made: Made) -> None:
     """A gateway's machine is suspended while the holder does not drive; the holder drives when it is awake."""
-    _client(made)
+    client(made)
     t = rng.uniform(4.0, 5.0)
     quiet_s = t - 3.0 + rng.uniform(0.3, 1.5)
     suspend = fault(t, "suspend", target="gw1") | {"for": rng.uniform(0.3, 2.0)}
@@ -32,7 +27,7 @@ def _suspended_while_held(rng: random.Random, made: Made) -> None:
 
 def _reset_while_held(rng: random.Random, made: Made) -> None:
     """The robot is lost while its holder does not drive; the holder drives when the robot is back."""
-    _client(made)
+    client(made)
     quiet_s = rng.uniform(5.0, 9.0)
     reset = fault(rng.uniform(5.0, 6.0), "reset", between=["robot", "gw1"])
     made["steps"] = [drive(3.0, "op1", quiet=quiet_s) | {"for": quiet_s + 3.0}, reset]
@@ -43,7 +38,7 @@ def _missed_a_fleet_latch(rng: random.Random, made: Made) -> None:
 
     Perhaps the latch was released meanwhile, and one of the other gateways has missed that.
     """
-    _client(made)
+    client(made)
     made["others"] = [
         {"name": f"other{number}", "host": f"other{number}", "router": "router1", "robot": f"r{number}"}
         for number in (2, 3)
@@ -58,17 +53,9 @@ def _missed_a_fleet_latch(rng: random.Random, made: Made) -> None:
     made["steps"] = [*steps, drive(4.0 + away_s - rng.uniform(0.0, 1.0), "op2", takeover=True)]
 
 
-def _rival_gone(rng: random.Random, made: Made) -> None:
-    """Two gateways serve the robot, and meet; one of them is killed, and stays away."""
-    steps = split(rng, made, t=3.5, s=rng.uniform(9.0, 11.0))
-    healed_at = 3.5 + steps[0]["for"]
-    kill = fault(healed_at + rng.uniform(1.5, 4.0), "kill", target=rng.choice(("gw1", "gw2"))) | {"for": 30.0}
-    made["steps"] = [*steps, kill, drive(healed_at + 15.0, "op1")]
-
-
 def _moves_an_arm(rng: random.Random, made: Made) -> None:
     """A program moves a motor that is none of the wheels, and says nothing more."""
-    _client(made)
+    client(made)
     made["robot"] = {"protocol": "wc2ec", "options": {"arm": True}, "device": WHEELS}
     ends = rng.choice(("kill", "pause", "pause"))
     t = rng.uniform(4.0, 6.0)
@@ -80,7 +67,7 @@ def _moves_an_arm(rng: random.Random, made: Made) -> None:
 
 def _late_start(rng: random.Random, made: Made) -> None:
     """A robot asks for datagrams late, while it is driven: it sleeps, and must get nothing but the stop after it."""
-    _client(made)
+    client(made)
     options = {"version": rng.choice(("1.1", "1.3", "1.4")), "udp": True, "starts_s": rng.uniform(3.0, 5.0)}
     made["robot"] = {"protocol": "tcpudp", "options": options, "device": {}}
     made["steps"] = [drive(3.0, "op1") | {"for": 5.0}]
@@ -97,7 +84,7 @@ def _stop_into_a_cut(rng: random.Random, made: Made) -> None:
 def _stopped_before_mode_3(rng: random.Random, made: Made) -> None:
     """Somebody chooses mode 3 on a gateway whose disk is slow, and loses the lease before the mode is written."""
     tcpudp(rng, made)
-    _client(made)
+    client(made)
     made["drivers"][1] |= {"router": "router1"}
     ends = rng.choice(("stop", "latch", "takeover", "kill"))
     meanwhile = {"t": 4.5, "when": "mode unwritten", "after": rng.uniform(0.0, 0.15)}
@@ -110,15 +97,6 @@ def _stopped_before_mode_3(rng: random.Random, made: Made) -> None:
     slow = fault(4.0, "threads", target="gw1", by=0.6) | {"for": 6.0}
     choice = drive(5.0, "op1", mode="autonomous", silent=True, then=None, holds=2.0)
     made["steps"] = [slow, choice, meanwhile, {"t": 9.0, "who": "op2", "do": "stop"}]
-
-
-def _owner_without_robot(rng: random.Random, made: Made) -> None:
-    """Two gateways serve the robot, and meet; then the way between the robot and one of them is cut for long."""
-    tcpudp(rng, made)
-    steps = split(rng, made, t=3.5, s=rng.uniform(9.0, 11.0))
-    t = 3.5 + steps[0]["for"] + rng.uniform(5.0, 6.0)
-    cut = fault(t, "cut", between=["robot", rng.choice(("gw1", "gw1", "gw2"))]) | {"for": rng.uniform(10.0, 14.0)}
-    made["steps"] = [*steps, cut, *(drive(t + rng.uniform(8.0, 9.0), who) for who in ("op1", "op2"))]
 
 
 def _wiggled_over_a_short_cut(rng: random.Random, made: Made) -> None:
@@ -135,14 +113,6 @@ def _wiggled_over_a_short_cut(rng: random.Random, made: Made) -> None:
     made["steps"].append(drive(5.0 + cut_s - rng.uniform(0.1, 0.3), "stick1") | {"for": 2.5})
 
 
-def _both_drive_and_meet(rng: random.Random, made: Made) -> None:
-    """Two gateways serve the robot, and each drives it when they meet; the one that stays drives on."""
-    tcpudp(rng, made)
-    steps = split(rng, made, t=3.5, s=rng.uniform(9.0, 11.0))
-    t = 3.5 + steps[0]["for"] - 1.0
-    made["steps"] = [*steps, *(drive(t, who) | {"for": 6.0} for who in ("op1", "op2"))]
-
-
 def _lost_while_stalled(rng: random.Random, made: Made) -> None:
     """The link to the robot stalls, and its connection is reset before it recovers; somebody drives again."""
     t = rng.uniform(4.0, 5.0)
@@ -152,23 +122,6 @@ def _lost_while_stalled(rng: random.Random, made: Made) -> None:
     made["steps"] = [drive(3.0, "op1"), cut, reset, drive(t + cut_s + 4.0, "op2", takeover=True)]
     if made["robot"]["protocol"] == "tcpudp":
         made["robot"]["options"]["udp"] = False
-
-
-def _latched_while_restarting(rng: random.Random, made: Made) -> None:
-    """Somebody latches a robot whose gateway is handing everything over; somebody else asks for the robot then."""
-    for each in made["drivers"]:
-        each |= {"options": {}, "router": "router1"}
-    made["network"] = {"delay_s": 0.0005, "jitter_s": 0.0005}
-    steps: list[Made] = []
-    for number in range(5):
-        t = 4.0 + 5.0 * number
-        steps.append(fault(t, "restart", target="gw1"))
-        latch = {"t": t, "who": "op1", "do": "latch", "fleet": rng.random() < 0.3}
-        when = rng.choice(("Hello unsent", "Hello sent", "Hello got"))
-        steps.append(latch | {"when": when, "after": round(rng.uniform(0.0, 0.001), 5)})
-        steps.append(drive(t + 1.5, "op2", takeover=True) | {"for": 1.0})
-        steps += [{"t": t + 3.5 + 0.5 * fleet, "who": "op1", "do": "unlatch", "fleet": bool(fleet)} for fleet in (0, 1)]
-    made["steps"] = steps
 
 
 def _latched_late(rng: random.Random, made: Made) -> None:
@@ -185,7 +138,7 @@ def _latched_late(rng: random.Random, made: Made) -> None:
 
 def _cut_after_long(rng: random.Random, made: Made) -> None:
     """A program that has driven for long is cut off for less than its deadman; all that it sent arrives at once."""
-    _client(made)
+    client(made)
     t = rng.uniform(24.0, 34.0)
     cut = fault(t, "cut", between=["pc1", "router1"]) | {"for": rng.uniform(0.9, 1.6)}
     made["steps"] = [drive(2.0, "op1", hz=20.0, deadman_s=2.0, wiggles=rng.random() < 0.3) | {"for": t + 2.0}, cut]
@@ -193,7 +146,7 @@ def _cut_after_long(rng: random.Random, made: Made) -> None:
 
 def _stop_while_away(rng: random.Random, made: Made) -> None:
     """Somebody stops a robot that its gateway cannot reach, and tries to."""
-    _client(made)
+    client(made)
     made["drivers"][1] |= {"options": {}, "router": "router1"}
     cut = fault(3.0, "cut", between=["robot", "gw1"], both=True) | {"for": 40.0}
     reset = fault(3.1, "reset", between=["robot", "gw1"])
@@ -219,25 +172,6 @@ def _garbled_stop(rng: random.Random, made: Made) -> None:
     """Somebody stops a driven robot with a text that is no UTF-8."""
     made["steps"] = [drive(3.0, "op1", hz=20.0) | {"for": 8.0}]
     made["steps"] += [{"t": rng.uniform(4.0, 7.0), "who": "op2", "do": "garbled stop"}]
-
-
-def _yielded_without_bus(rng: random.Random, made: Made) -> None:
-    """Two gateways serve the robot, and meet; then one of them loses its bus, while the robot is driven."""
-    tcpudp(rng, made)
-    steps = split(rng, made, t=3.5, s=rng.uniform(9.0, 11.0))
-    t = 3.5 + steps[0]["for"] + rng.uniform(5.0, 6.0)
-    steps += [drive(t - 1.0, who) | {"for": 8.0} for who in ("op1", "op2")]
-    made["steps"] = [*steps, fault(t, "unlink", target=rng.choice(("gw1", "gw2"))) | {"for": rng.uniform(3.0, 8.0)}]
-
-
-def _latched_and_owner_gone(rng: random.Random, made: Made) -> None:
-    """Two gateways serve the robot, and meet; it is latched, and the one that serves it is killed."""
-    tcpudp(rng, made)
-    steps = split(rng, made, t=3.5, s=rng.uniform(9.0, 11.0))
-    t = 3.5 + steps[0]["for"] + 5.0
-    latches = [{"t": t, "who": who, "do": "latch"} for who in ("op1", "op2")]
-    made["steps"] = [*steps, *latches, fault(t + rng.uniform(1.5, 3.0), "kill", target="owner") | {"for": 30.0}]
-    made["steps"] += [drive(t + after, who) for after in (6.0, 9.0) for who in ("op1", "op2")]
 
 
 def _backwards(rng: random.Random, made: Made) -> None:
@@ -304,37 +238,34 @@ def _wheels_deflected_at_rest(rng: random.Random, made: Made) -> None:
     made["steps"].append(drive(9.0, "stick1") | {"for": rng.uniform(0.5, 3.0)})
 
 
-def _waits_and_learns(rng: random.Random, made: Made) -> None:
-    """A robot drives itself when its gateway is killed, and the one that waits, which was asked of it, serves it."""
-    tcpudp(rng, made)
-    made["robot"]["options"].pop("self_stop_s", None)
-    second_gateway(made)
-    _client(made)
-    choice = drive(4.0, "op1", mode="autonomous", silent=True, then=None) | {"for": 9.0}
-    kill = fault(3.9, "kill", target="owner", when="mode read", after=round(rng.uniform(1.0, 2.5), 3))
-    made["steps"] = [choice, kill | {"for": 12.0}]
-
-
 def _killed_before_the_disk(rng: random.Random, made: Made) -> None:
     """A gateway whose disk is slow is killed about when its robot is told to drive itself, and starts again."""
     tcpudp(rng, made)
     made["robot"]["options"] |= {"lossless": True}
     made["robot"]["options"].pop("self_stop_s", None)
-    _client(made)
+    client(made)
     slow = fault(3.5, "threads", target="gw1", by=0.4) | {"for": 3.0}
     choice = drive(4.0, "op1", mode="autonomous", silent=True, then=None) | {"for": 9.0}
     kill = fault(3.9, "kill", target="gw1", when="mode read", after=round(rng.uniform(0.005, 0.2), 3))
     made["steps"] = [slow, choice, kill | {"for": rng.uniform(0.2, 2.0)}]
 
 
-def _silent_to_the_owner(rng: random.Random, made: Made) -> None:
-    """Two gateways serve the robot, and meet; then the robot sends the owner nothing more, and still hears it."""
-    tcpudp(rng, made)
-    made["robot"]["options"]["udp"] = False
-    steps = split(rng, made, t=3.5, s=rng.uniform(9.0, 11.0))
-    t = 3.5 + steps[0]["for"] + rng.uniform(5.0, 6.0)
-    mute = fault(t, "mute", target="owner") | {"for": rng.uniform(12.0, 16.0)}
-    made["steps"] = [*steps, mute, *(drive(t + rng.uniform(8.0, 9.0), who) for who in ("op1", "op2"))]
+def _one_wheel_is_let_go(rng: random.Random, made: Made) -> None:
+    """A program pushes two motors, falls silent, and its link stalls; then it says neutral for one of them only."""
+    made["robot"] = {"protocol": "wc2ec", "options": {}, "device": WHEELS}
+    made["drivers"][0] |= {"options": {"client": False, "dated": rng.random() < 0.5}, "router": "router1"}
+    made["steps"] = [drive(3.0, "op1", wheels=True) | {"for": rng.uniform(2.0, 2.5)}]
+    made["steps"].append(fault(rng.uniform(4.9, 5.2), "cut", between=["robot", "gw1"]) | {"for": rng.uniform(0.7, 1.5)})
+
+
+def _one_wheel_pushed(rng: random.Random, made: Made) -> None:
+    """An external controller turns a robot on one wheel when somebody stops it, and continues."""
+    made["robot"] = {"protocol": "wc2ec", "options": {}, "device": WHEELS}
+    gateway = stick(rng, made, alone=rng.random() < 0.5)
+    gateway["hq"] = ["wc2ec"]
+    made["programs"][0] |= {"protocol": "wc2ec", "options": {"one": True}}
+    stop = {"t": rng.uniform(5.0, 6.0), "who": "op1", "do": "stop"}
+    made["steps"] = [drive(3.5, "stick1") | {"for": 6.0}, stop]
 
 
 FOUND: tuple[Callable[[random.Random, Made], None], ...] = (
@@ -344,29 +275,23 @@ FOUND: tuple[Callable[[random.Random, Made], None], ...] = (
     _reset_while_held,
     _missed_a_fleet_latch,
     _missed_a_fleet_latch,
-    _rival_gone,
     _moves_an_arm,
     _late_start,
     _stop_into_a_cut,
     _stopped_before_mode_3,
-    _owner_without_robot,
     _wiggled_over_a_short_cut,
-    _both_drive_and_meet,
     _lost_while_stalled,
-    _latched_while_restarting,
     _latched_late,
     _cut_after_long,
     _stop_while_away,
     _light_after_a_stop,
     _garbled_stop,
-    _yielded_without_bus,
-    _latched_and_owner_gone,
     _backwards,
     _late_and_silent,
     _frozen_program,
     _controller_that_computes,
     _wheels_deflected_at_rest,
-    _waits_and_learns,
     _killed_before_the_disk,
-    _silent_to_the_owner,
+    _one_wheel_is_let_go,
+    _one_wheel_pushed,
 )

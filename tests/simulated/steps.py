@@ -57,3 +57,8 @@ def split(rng: random.Random, made: Made, *, t: float, s: float) -> list[Made]:
     """Cut the bus between two gateways, so that both serve the robot, and heal it."""
     second_gateway(made)
     return [fault(t, "cut", between=["router1", "router2"], both=True, **{"for": s})]
+
+
+def client(made: Made) -> None:
+    """Let the first program be the Python client, which dates its commands and renews its lease."""
+    made["drivers"][0] |= {"options": {}, "router": "router1"}

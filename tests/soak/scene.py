@@ -148,7 +148,7 @@ class Scene:
         self.robots = {name: self._robot(name) for name in ROBOT_PLANS}
 
     def _robot(self, name: str, port: int = 0) -> MovingRobot:
-        options = {"port": port, "keep": 200, **({"side": 200} if ROBOT_PLANS[name].protocol == "tcpudp" else {})}
+        options = {"port": port, **({"side": 200} if ROBOT_PLANS[name].protocol == "tcpudp" else {})}
         enter, host = self.field.enter, self.field_link.far
         return MovingRobot(self.stack, ROBOT_PLANS[name].kind, host, enter, self.seed, **options)
 

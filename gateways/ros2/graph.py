@@ -56,12 +56,10 @@ class Graph:
 
     def watched(self) -> list[str]:
         """List the expressions of the tokens that matter."""
-        watched = [endpoints_of(self._domain, Kind.PUBLISHER, name) for name in self._wanted]
+        watched = [(Kind.PUBLISHER, name) for name in self._wanted]
         if self.command_topic is not None:
-            watched += [
-                endpoints_of(self._domain, kind, self.command_topic) for kind in (Kind.SUBSCRIBER, Kind.PUBLISHER)
-            ]
-        return watched
+            watched += [(Kind.SUBSCRIBER, self.command_topic), (Kind.PUBLISHER, self.command_topic)]
+        return [endpoints_of(self._domain, kind, name) for kind, name in watched]
 
     def appeared(self, token: str) -> Endpoint:
         """Enter an endpoint; raise ProtocolError for one that is not of this robot, or not as it should be."""
@@ -93,8 +91,7 @@ class Graph:
         if self.wrong.pop(token, None) is not None:
             return True
         for table in (self.publishers, self.subscribers, self.drivers):
-            endpoint = table.pop(token, None)
-            if endpoint is not None:
+            if (endpoint := table.pop(token, None)) is not None:
                 for gid in endpoint.gids():
                     self.gids.pop(gid, None)
                 return True

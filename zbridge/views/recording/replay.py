@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -155,7 +155,7 @@ class Replay:
         async with contextlib.AsyncExitStack() as stack:
             watching = []
             for recorded, name in self._plan.names.items():
-                ownership = await stack.enter_async_context(self._claimed(name))
+                ownership = await self._claim(name, stack)
                 keys, status = KeySpace(self._plan.realm, name), self._plan.statuses.get(recorded)
                 robot = ReplayedRobot(self._bus, keys, f"a recording of {recorded}", status)
                 self.robots[recorded] = robot
@@ -167,22 +167,19 @@ class Replay:
             self.player.start()
             await race(self._ended.wait(), *watching, *serving)
 
-    @contextlib.asynccontextmanager
-    async def _claimed(self, name: str) -> AsyncIterator[Ownership]:
-        """Claim a name as a gateway does: gateways that come later wait, and say so."""
-        keys = KeySpace(self._plan.realm, name)
+    async def _claim(self, name: str, stack: contextlib.AsyncExitStack) -> Ownership:
+        """Claim a name as a gateway does, until the stack is left: gateways that come later wait, and say so."""
+        keys, taken = KeySpace(self._plan.realm, name), Held(f"{name} is alive: replay it under another name")
         if await self._bus.alive(keys.alive("gateway")):
-            raise Held(f"{name} is alive: replay it under another name")
+            raise taken
         ownership = Ownership(self._bus, keys)
+        stack.callback(ownership.release)
         try:
-            try:
-                async with asyncio.timeout(CLAIM_S):
-                    await ownership.take()
-            except TimeoutError:
-                raise Held(f"{name} is alive: replay it under another name") from None
-            yield ownership
-        finally:
-            ownership.release()
+            async with asyncio.timeout(CLAIM_S):
+                await ownership.take()
+        except TimeoutError:
+            raise taken from None
+        return ownership
 
     async def _watch(self, ownership: Ownership, name: str) -> None:
         await ownership.watch(_Replayed())

@@ -143,8 +143,7 @@ class Teleop:
         elif self._driving.came(gid, endpoint.node.full_name, now, early=late or now < self._settled_at):
             self._tokens[token] = gid
             if gid not in self._pilots:
-                self._pilots[gid] = self._pilot(gid)
-            self._limits.setdefault(gid, RateLimit(RATE_HZ))
+                self._pilots[gid], self._limits[gid] = self._pilot(gid), RateLimit(RATE_HZ)
             self._known.update(dict.fromkeys(endpoint.gids(), gid))
         else:
             self._counts["publishers_refused"].value += 1
@@ -170,8 +169,7 @@ class Teleop:
         self._known = {also: known for also, known in self._known.items() if known != gid}
         self._limits.pop(gid, None)
         self._driving.gone(gid)
-        pilot = self._pilots.pop(gid, None)
-        if pilot is not None:
+        if (pilot := self._pilots.pop(gid, None)) is not None:
             pilot.release()
 
     def _pilot(self, gid: bytes) -> Pilot:

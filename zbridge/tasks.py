@@ -82,6 +82,14 @@ async def race(*work: Coroutine[Any, Any, object]) -> None:
         await asyncio.shield(asyncio.gather(*tasks, return_exceptions=True))
 
 
+async def occurs(event: asyncio.Event, within_s: float | None) -> bool:
+    """Wait for an event, so long at most (None: as long as it takes); return whether it is set."""
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(within_s):
+            await event.wait()
+    return event.is_set()
+
+
 async def until(event: asyncio.Event, work: Coroutine[Any, Any, None]) -> None:
     """Run a coroutine until it ends, or an event is set: then cancel it and wait until it has ended."""
     await race(work, event.wait())

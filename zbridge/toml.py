@@ -114,7 +114,7 @@ def _explain(raw: Any, kind: type[Any], text: str) -> str:
     path = (match["path"] or match["index"] or "") if match else ""
     what = text[: match.start()] if match else text
     if unknown := re.match(r"Object contains unknown field `(.+)`", what):
-        known = ", ".join(_field_names(_type_at(kind, path)))
+        known = ", ".join(field.encode_name for field in getattr(_type_at(kind, path), "fields", ()))
         key = f"{path}.{unknown[1]}" if path else unknown[1]
         return f"{_short(key)} = {_shown(raw, key)}: unknown key; expected one of {known}"
     if missing := re.match(r"Object missing required field `(.+)`", what):
@@ -166,7 +166,3 @@ def _plain_type(at: inspect.Type) -> inspect.Type:
         types = [member for member in at.types if not isinstance(member, inspect.NoneType)]
         return types[0] if len(types) == 1 else at
     return at
-
-
-def _field_names(at: inspect.Type) -> list[str]:
-    return [field.encode_name for field in at.fields] if isinstance(at, inspect.StructType) else []

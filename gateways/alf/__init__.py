@@ -63,9 +63,9 @@ async def _simulate(simulation: Simulation) -> None:
         first, *others = fragile_vehicle(dialect.value, servers=links, seed=simulation.seed)
         await first.simulate(simulation.addresses, simulation.ready, *others)
     else:
-        from gateways.alf.simulator import simulate
+        from gateways.alf.simulator import VehicleSimulator
 
-        await simulate(simulation)
+        await VehicleSimulator(simulation.seed, dialect, len(simulation.addresses)).run(simulation)
 
 
 async def _simulate_hq(simulation: HqSimulation) -> None:

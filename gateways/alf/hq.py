@@ -15,12 +15,12 @@ import numpy.typing as npt
 
 from gateways.alf import messages
 from gateways.alf.session import VehicleRole
-from gateways.alf.translate import FULL_LOCK_DEG, NAME, UNITS, Scale
+from gateways.alf.translate import FULL_LOCK_DEG, NAME, UNITS
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Motion, Motor, Scan, Scanner
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
-from zbridge.protocol import EncodeError, Exported, HqSide, Limits, Metrics, ProtocolError, Send, Telemetry
+from zbridge.protocol import EncodeError, Exported, HqSide, Limits, Metrics, Positive, ProtocolError, Send, Telemetry
 
 DEADMAN_S = 0.3
 """Legacy HQ programs repeat their command every 20 ms."""
@@ -42,8 +42,8 @@ class AlfHqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     dialect: Literal["text", "binary"] = "text"
     serve: Literal["auto", "drive", "laser", "both"] = "auto"
     points: Annotated[int, msgspec.Meta(ge=2, le=messages.MOST_POINTS)] = messages.POINTS
-    acceleration_m_s2: Scale | None = None
-    gyro_rad_s: Scale | None = None
+    acceleration_m_s2: Positive | None = None
+    gyro_rad_s: Positive | None = None
     gap_s: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.0
 
 
@@ -70,9 +70,9 @@ class AlfClient(VehicleRole):
         if self.scanner is not None:
             self.outbox.withdraw(self.scanner)
 
-    def send_scanner(self, scanner: bytes | None) -> None:
+    def send_scanner(self, scanner: bytes) -> None:
         """Send a scanner init that the client does not have yet, before any measurement that needs it."""
-        if scanner is not None and scanner != self.scanner and self.laser:
+        if scanner != self.scanner and self.laser:
             self.outbox.clear("scan")
             self.outbox.put_exempt(scanner)
             self.scanner = scanner
@@ -95,14 +95,13 @@ class Sweep:
     ) -> None:
         self.source, self.scanner = _geometry(scan), scanner
         angle_min, increment, count, range_min, range_max = self.source
-        self.count = count
         self._points = points
-        known = scanner is not None and scanner.angle_min == angle_min and scanner.angle_increment == increment
+        self._places: npt.NDArray[np.intp] | None = None
+        angle_max = angle_min + increment * (count - 1)
         if count == points:
-            angle_max = scanner.angle_max if known and scanner is not None else angle_min + increment * (count - 1)
-            self._places: npt.NDArray[np.intp] | None = None
+            if scanner is not None and (scanner.angle_min, scanner.angle_increment) == (angle_min, increment):
+                angle_max = scanner.angle_max
         else:
-            angle_max = angle_min + increment * (count - 1)
             self._places = np.rint(np.linspace(0, max(0, count - 1), points)).astype(np.intp)
             increment = increment * (count - 1) / (points - 1) or math.radians(1.0)
         time_s = scanner.time_increment_s if scanner is not None else 0.0

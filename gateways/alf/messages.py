@@ -15,7 +15,7 @@ from typing import Annotated, ClassVar, TypeVar
 
 import msgspec
 
-from zbridge.protocol import Codec, ProtocolError
+from zbridge.protocol import Codec, ProtocolError, Role
 from zbridge.wire import (
     F32,
     I32,
@@ -46,14 +46,6 @@ class AlfDialect(Enum):
     TEXT = "text"
 
 
-class AlfSender(Enum):
-    """Who sends a message."""
-
-    VEHICLE = "vehicle"
-    HQ = "hq"
-    BOTH = "both"
-
-
 class AlfMessage(Message, frozen=True):
     """A message of this protocol."""
 
@@ -72,11 +64,11 @@ Steering = Annotated[int, Scalar("B"), Whole(-90, 90)]
 
 
 class AlfSpec(msgspec.Struct, frozen=True, eq=False):
-    """A row of the message table."""
+    """A row of the message table. sender: None if both send it."""
 
     id: int
     name: str
-    sender: AlfSender
+    sender: Role | None
     message: type[AlfMessage]
     binary: BinaryCodec[AlfMessage]
     text: TextCodec[AlfMessage]
@@ -86,7 +78,7 @@ MESSAGES: dict[int, AlfSpec] = {}
 """The message table, by id."""
 
 
-def message(message_id: int, name: str, sender: AlfSender) -> Callable[[type[A]], type[A]]:
+def message(message_id: int, name: str, sender: Role | None) -> Callable[[type[A]], type[A]]:
     """Enter a declaration into the message table."""
 
     def enter(declared: type[A]) -> type[A]:
@@ -103,7 +95,7 @@ def message(message_id: int, name: str, sender: AlfSender) -> Callable[[type[A]]
     return enter
 
 
-@message(1, "measurement", AlfSender.VEHICLE)
+@message(1, "measurement", Role.ROBOT)
 class Measurement(AlfMessage, frozen=True, eq=False):
     """One sweep of the scanner. points: int64[n], mm; the valid indices are inclusive."""
 
@@ -114,7 +106,7 @@ class Measurement(AlfMessage, frozen=True, eq=False):
     last_valid: U32
 
 
-@message(2, "scanner init", AlfSender.VEHICLE)
+@message(2, "scanner init", Role.ROBOT)
 class ScannerInit(AlfMessage, frozen=True):
     """The geometry of the scanner: degrees, ms, mm."""
 
@@ -131,7 +123,7 @@ class ScannerInit(AlfMessage, frozen=True):
             raise ProtocolError(f"scanner init with angles {angles}")
 
 
-@message(3, "drive command", AlfSender.HQ)
+@message(3, "drive command", Role.HQ)
 class DriveCommand(AlfMessage, frozen=True):
     """How the vehicle shall move. ``direction``: 0 forward, 1 backward."""
 
@@ -141,7 +133,7 @@ class DriveCommand(AlfMessage, frozen=True):
     light: Bool
 
 
-@message(4, "drive info", AlfSender.VEHICLE)
+@message(4, "drive info", Role.ROBOT)
 class DriveInfo(AlfMessage, frozen=True):
     """How the vehicle moves. Accelerations: ``lateral`` to the right, ``vertical`` towards the ground."""
 
@@ -160,7 +152,7 @@ class DriveInfo(AlfMessage, frozen=True):
             raise ProtocolError(f"drive info with {values} and temperature {self.temperature:g}")
 
 
-@message(255, "end", AlfSender.BOTH)
+@message(255, "end", None)
 class End(AlfMessage, frozen=True):
     """The end of the conversation: both sides close."""
 
@@ -171,9 +163,9 @@ class End(AlfMessage, frozen=True):
             raise ProtocolError(f"end with {self.always_1}, expected 1")
 
 
-def sent_by(sender: AlfSender) -> frozenset[int]:
+def sent_by(sender: Role) -> frozenset[int]:
     """List the ids that one side sends."""
-    return frozenset(spec.id for spec in MESSAGES.values() if spec.sender in (sender, AlfSender.BOTH))
+    return frozenset(spec.id for spec in MESSAGES.values() if spec.sender in (sender, None))
 
 
 # Text
@@ -272,12 +264,13 @@ _SKIPPED = 4096
 def codecs() -> tuple[Codec, ...]:
     """List the messages of both dialects and both sides for the conformance kit; one measurement has two points."""
     found = []
-    for sender, whole in ((AlfSender.VEHICLE, (DriveInfo(1, 2, 3, 4, 5, 6, 7, 0.5),)), (AlfSender.HQ, ())):
+    for name, sender in (("vehicle", Role.ROBOT), ("hq", Role.HQ)):
         ids = sent_by(sender)
+        whole = (DriveInfo(1, 2, 3, 4, 5, 6, 7, 0.5),) if sender is Role.ROBOT else ()
         messages = (*(MESSAGES[number].message for number in sorted(ids - {DriveInfo.spec.id})), *whole)
         end = binary_frame_end(ids, lambda: 2)
         found += [
-            Codec(f"text, {sender.value}", write_text, partial(read_text, ids=ids), text_frame_end(4096), messages),
-            Codec(f"binary, {sender.value}", write_binary, partial(read_binary, ids=ids), end, messages),
+            Codec(f"text, {name}", write_text, partial(read_text, ids=ids), text_frame_end(4096), messages),
+            Codec(f"binary, {name}", write_binary, partial(read_binary, ids=ids), end, messages),
         ]
     return tuple(found)

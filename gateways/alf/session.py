@@ -29,7 +29,6 @@ class AlfSession(Session[messages.AlfMessage]):
 
     kept: ClassVar[dict[str, Any]] = {"points": int, "_broken": bool}
     handled = frozenset({messages.End})
-    _SENT_BY_PEER: frozenset[int]
 
     def __init__(
         self,
@@ -42,7 +41,7 @@ class AlfSession(Session[messages.AlfMessage]):
     ) -> None:
         self.dialect = dialect
         self.points = points
-        self._ids = self._SENT_BY_PEER
+        self._ids = messages.sent_by(Role.ROBOT if self.role is Role.HQ else Role.HQ)
         self._broken = False
         self._points_from_scanner = points_from_scanner
         if dialect is messages.AlfDialect.TEXT:
@@ -93,27 +92,15 @@ class AlfSession(Session[messages.AlfMessage]):
 
 
 class AlfHqRole(AlfSession):
-    """We play HQ towards a vehicle. ``drives``: the first command of a link that drives; it repeats from the start."""
+    """We play HQ towards a vehicle. ``at_first``: the command that a link that drives repeats from the start."""
 
     role = Role.HQ
-    _SENT_BY_PEER = messages.sent_by(messages.AlfSender.VEHICLE)
-
-    def __init__(
-        self,
-        dialect: messages.AlfDialect,
-        *,
-        points: int = messages.POINTS,
-        points_from_scanner: bool = False,
-        gap_s: float = 0.0,
-        drives: messages.DriveCommand | None = None,
-    ) -> None:
-        super().__init__(dialect, points=points, points_from_scanner=points_from_scanner, gap_s=gap_s)
-        self._at_first = drives
+    at_first: messages.DriveCommand | None = None
 
     def opened(self, now: float) -> None:
         super().opened(now)
-        if self._at_first is not None:
-            self.drive(self._at_first, now)
+        if self.at_first is not None:
+            self.drive(self.at_first, now)
 
     def drive(self, command: messages.DriveCommand, now: float, *, urgent: bool = False) -> None:
         """Send a command at once, and again every 20 ms until the next one."""
@@ -126,7 +113,6 @@ class VehicleRole(AlfSession):
     """We play the vehicle towards an HQ."""
 
     role = Role.ROBOT
-    _SENT_BY_PEER = messages.sent_by(messages.AlfSender.HQ)
 
 
 def points_of(scanner: messages.ScannerInit) -> int:

@@ -15,7 +15,6 @@ import numpy as np
 from gateways.alf.messages import AlfDialect, AlfMessage, DriveCommand, DriveInfo, Measurement, ScannerInit
 from gateways.alf.session import VehicleRole
 from gateways.alf.translate import DRIVE, LASER, VEHICLE
-from zbridge.protocol import Simulation
 from zbridge.simulation.simulator import STEP_S, Simulator
 from zbridge.simulation.world import Body, cast
 from zbridge.transport import Conversation
@@ -134,9 +133,3 @@ class VehicleSimulator(Simulator[AlfMessage]):
             self.tell(self.car.measure(), link=self._laser)
         if steps % _INFO_EVERY == 0:
             self.tell(self.car.info(), link=self._drive)
-
-
-async def simulate(simulation: Simulation) -> None:
-    """Run a simulated vehicle until cancelled."""
-    dialect = AlfDialect(simulation.dialect or "text")
-    await VehicleSimulator(simulation.seed, dialect, len(simulation.addresses)).run(simulation)

@@ -24,6 +24,7 @@ from zbridge.protocol import (
     Metrics,
     NotReady,
     Outcome,
+    Positive,
     ProtocolError,
     RobotSide,
     Telemetry,
@@ -52,7 +53,6 @@ UNITS = {
 """One unit of acceleration (m/s2) and of gyro (rad/s), unless the options set another."""
 
 Ints = npt.NDArray[np.int64]
-Scale = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
 
 
 class AlfOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -62,8 +62,8 @@ class AlfOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     points: Annotated[int, msgspec.Meta(ge=1, le=messages.MOST_POINTS)] = messages.POINTS
     points_from_scanner: bool = False
     speed_full: Annotated[int, msgspec.Meta(ge=1, le=255)] = 100
-    acceleration_m_s2: Scale | None = None
-    gyro_rad_s: Scale | None = None
+    acceleration_m_s2: Positive | None = None
+    gyro_rad_s: Positive | None = None
     gap_s: Annotated[float, msgspec.Meta(ge=0, le=0.02)] = 0.0
 
 
@@ -100,18 +100,15 @@ class AlfRobot(RobotSide):
         self._command = self._neutral()
 
     def session(self, link: str, peer: str) -> AlfHqRole:
-        drives = link == self.link_names[0]
-        if drives:
-            self._backward = False
-            self._command = self._neutral()
         session = AlfHqRole(
             self._dialect,
             points=self.options.points,
             points_from_scanner=self.options.points_from_scanner,
             gap_s=self.options.gap_s,
-            drives=self._command if drives else None,
         )
-        if drives:
+        if link == self.link_names[0]:
+            self._backward = False
+            session.at_first = self._command = self._neutral()
             self.driving = session
         return session
 

@@ -70,9 +70,9 @@ async def _simulate(simulation: Simulation) -> None:
         robot = FragileRobot(version=simulation.version or "1.3", udp=simulation.udp, seed=simulation.seed)
         await robot.simulate(simulation.addresses, simulation.ready)
     else:
-        from gateways.tcpudp.simulator import simulate
+        from gateways.tcpudp.simulator import RobotSimulator
 
-        await simulate(simulation)
+        await RobotSimulator(simulation.seed, simulation.version or "1.3", udp=simulation.udp).run(simulation)
 
 
 async def _simulate_hq(simulation: HqSimulation) -> None:

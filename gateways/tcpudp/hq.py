@@ -41,6 +41,11 @@ DEADMAN_S = 1.3
 """Legacy HQ programs repeat the position of their stick every 0.5 s."""
 CLIENTS = range(2, 256)
 """Client ids; 1 is the server's."""
+TEXT_CHARACTERS = 1000
+_NEARLY = 1 + 1e-9
+_SIZES = ("1.3", "1.4")
+"""Versions whose clients are announced the size of the map."""
+_FEATURES = {feature.value for feature in Feature}
 
 
 class TcpUdpHq(HqSide):
@@ -55,7 +60,10 @@ class TcpUdpHq(HqSide):
         self.options = options
         self.view = view
         self.datagrams = options.udp
-        self._display = TcpUdpDisplay(options, view)
+        self._unit_m = options.length_unit_m
+        self._most_side = most_side(UDP_BYTES if options.udp else TCP_BYTES)
+        self._last: dict[str, tuple[FleetMessage, Send | None]] = {}
+        """What was shown last of each path: clients that connect or ask later get the same bytes."""
 
     # Clients
 
@@ -67,7 +75,7 @@ class TcpUdpHq(HqSide):
         return ((topics.CMD_MODE, Mode("none")),)
 
     def session(self, number: int, bounds: Limits) -> TcpUdpClient:
-        geometry = self._display.geometry()
+        geometry = self._geometry()
         bounds = msgspec.structs.replace(bounds, gap_s=self.options.gap_s)
         return TcpUdpClient(bounds, self._settings(geometry), number, self.options, geometry)
 
@@ -107,7 +115,14 @@ class TcpUdpHq(HqSide):
     # What is shown
 
     def show(self, topic: Topic, message: FleetMessage) -> Send | None:
-        return self._display.show(topic, message)
+        translate = _SHOWN.get(topic.path)
+        if translate is None:
+            return None
+        last, send = self._last.get(topic.path, (None, None))
+        if last is not message:
+            send = translate(self, message)
+            self._last[topic.path] = message, send
+        return send
 
     def answer(self, session: TcpUdpClient, topic: Topic, message: FleetMessage | None, now: float) -> None:
         missing = None
@@ -127,67 +142,18 @@ class TcpUdpHq(HqSide):
     def tell(self, session: TcpUdpClient, text: str, now: float) -> None:
         session.send(packets.DebugMessage(ascii_text(text)))
 
-    # What is understood
-
-    def take(self, session: TcpUdpClient, message: packets.Packet) -> tuple[Telemetry, ...]:
-        return TRANSLATE.get(type(message), raw_command)(session, message, self.options)
-
-
-_FEATURES = {feature.value for feature in Feature}
-
-
-TEXT_CHARACTERS = 1000
-MOST_SIDE = most_side(UDP_BYTES)
-_NEARLY = 1 + 1e-9
-_SIZES = ("1.3", "1.4")
-"""Versions whose clients are announced the size of the map."""
-
-
-@cache
-def no_map() -> Map:
-    """Return the map of a robot that has none."""
-    import numpy as np
-
-    return Map(0, 0, 1.0, (0.0, 0.0), np.zeros((0, 0), np.uint8))
-
-
-class TcpUdpDisplay:
-    """Shows one robot to the clients of one listener."""
-
-    def __init__(self, options: TcpUdpHqOptions, view: RobotView) -> None:
-        self._options = options
-        self._view = view
-        self._unit_m = options.length_unit_m
-        self._most_side = MOST_SIDE if options.udp else most_side(TCP_BYTES)
-        self._last: dict[str, tuple[FleetMessage, Send | None]] = {}
-        """What was shown last of each path: clients that connect or ask later get the same bytes."""
-
-    def __repr__(self) -> str:
-        return f"<TcpUdpDisplay of {sorted(self._last)}>"
-
-    def show(self, topic: Topic, message: FleetMessage) -> Send | None:
-        """Encode a message for all clients; None if there is no packet for it. Raises EncodeError."""
-        translate = _SHOWN.get(topic.path)
-        if translate is None:
-            return None
-        last, send = self._last.get(topic.path, (None, None))
-        if last is not message:
-            send = translate(self, message)
-            self._last[topic.path] = message, send
-        return send
-
-    def geometry(self) -> Geometry:
+    def _geometry(self) -> Geometry:
         """Choose the geometry that a new client is announced: of the robot's map, else of the options."""
-        if self._view.map is not None and self._view.map.cells.size:
+        if self.view.map is not None and self.view.map.cells.size:
             with contextlib.suppress(EncodeError):
-                return announceable(self._view.map, self._unit_m, self._most_side, self._frame)
-        size, interval = self._options.slam_map_size, self._options.slam_map_interval
+                return announceable(self.view.map, self._unit_m, self._most_side, self._frame)
+        size, interval = self.options.slam_map_size, self.options.slam_map_interval
         return Geometry(min(size, self._most_side * interval), interval)
 
     def _pose(self, message: Pose) -> Send:
         if not math.isfinite(message.x + message.y + message.heading):
             raise EncodeError(f"position {message.x:g}, {message.y:g}, {message.heading:g}")
-        heading_deg = math.degrees(message.heading - self._options.heading_offset)
+        heading_deg = math.degrees(message.heading - self.options.heading_offset)
         return newest_of(
             "pose", packets.ServerPosition(message.x / self._unit_m, message.y / self._unit_m, heading_deg)
         )
@@ -235,7 +201,7 @@ class TcpUdpDisplay:
 
     @property
     def _frame(self) -> MapFrame:
-        return MapFrame(own=self._view.protocol in (NAME, None), origin=self._options.map_origin)
+        return MapFrame(own=self.view.protocol in (NAME, None), origin=self.options.map_origin)
 
     def _lidar(self, message: Switch) -> Send:
         return newest_of("lidar", packets.ServerLidarStatus(ON if message.on else OFF))
@@ -255,6 +221,19 @@ class TcpUdpDisplay:
             return each_once(packets.ChatMessage(message.body))
         return each_once(packets.OpaquePacket(message.id, message.body)) if spec is None else None
 
+    # What is understood
+
+    def take(self, session: TcpUdpClient, message: packets.Packet) -> tuple[Telemetry, ...]:
+        return TRANSLATE.get(type(message), raw_command)(session, message, self.options)
+
+
+@cache
+def no_map() -> Map:
+    """Return the map of a robot that has none."""
+    import numpy as np
+
+    return Map(0, 0, 1.0, (0.0, 0.0), np.zeros((0, 0), np.uint8))
+
 
 def ascii_text(text: str) -> str:
     """Return a text as the protocol's strings hold it, cut to the length of one packet."""
@@ -270,11 +249,11 @@ def _request(session: TcpUdpClient, now: float) -> None:
 
 
 _REQUEST = packets.encode_packet(packets.ServerGetSimulatedLidarData(), RobotRole.sender_id)
-_SHOWN: dict[str, Callable[[TcpUdpDisplay, Any], Send | None]] = {
-    topics.POSE.path: TcpUdpDisplay._pose,
-    topics.MAP.path: TcpUdpDisplay._map,
-    topics.LIDAR.path: TcpUdpDisplay._lidar,
-    topics.CAMERA.path: TcpUdpDisplay._camera,
-    topics.TEXT.path: TcpUdpDisplay._text,
-    topics.RAW(NAME).path: TcpUdpDisplay._raw,
+_SHOWN: dict[str, Callable[[TcpUdpHq, Any], Send | None]] = {
+    topics.POSE.path: TcpUdpHq._pose,
+    topics.MAP.path: TcpUdpHq._map,
+    topics.LIDAR.path: TcpUdpHq._lidar,
+    topics.CAMERA.path: TcpUdpHq._camera,
+    topics.TEXT.path: TcpUdpHq._text,
+    topics.RAW(NAME).path: TcpUdpHq._raw,
 }

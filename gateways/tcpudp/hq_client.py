@@ -177,11 +177,7 @@ def _ask_pose(client: TcpUdpClient, packet: packets.ClientGetPosition, options: 
 
 def raw_command(client: TcpUdpClient, packet: packets.Packet, options: TcpUdpHqOptions) -> Commands:
     """Pass on a packet that no fleet message holds."""
-    if isinstance(packet, packets.OpaquePacket):
-        raw = Raw(packet.id, packet.body)
-    else:
-        raw = Raw(packet.spec.id, packet.spec.codec.encode(packet))
-    return ((topics.CMD_RAW(NAME), raw),)
+    return ((topics.CMD_RAW(NAME), Raw(*packet.raw())),)
 
 
 _MODES = {1: Mode("none"), 2: Mode("manual"), 3: Mode("autonomous")}

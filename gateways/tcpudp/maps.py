@@ -121,13 +121,20 @@ def resampled(grid: Map, side: int, cell_m: float, begin: tuple[float, float] = 
         x, y = begin
         rows, row_starts, row = _starts(grid.rows, side, ratio, y / grid.cell)
         columns, column_starts, column = _starts(grid.columns, side, ratio, x / grid.cell)
-        covered = grid.cells[:rows, :columns]
-        if covered.size and covered.max() > _OCCUPIED:
-            covered = np.where(covered > _OCCUPIED, np.uint8(0), covered)
+        covered = known_cells(grid.cells[:rows, :columns])
         if len(row_starts) and len(column_starts):
             pooled = np.maximum.reduceat(np.maximum.reduceat(covered, row_starts, axis=0), column_starts, axis=1)
             cells[row : row + len(row_starts), column : column + len(column_starts)] = pooled
     return np.ascontiguousarray(cells.T).tobytes()
+
+
+def known_cells(cells: Cells) -> Cells:
+    """Turn cells other than 0, 1, 2 into unknown."""
+    import numpy as np
+
+    if not cells.size or cells.max() <= _OCCUPIED:
+        return cells
+    return np.where(cells <= _OCCUPIED, cells, np.uint8(0))
 
 
 def check(grid: Map) -> None:

@@ -15,7 +15,7 @@ from typing import ClassVar, TypeVar
 import msgspec
 
 from gateways.tcpudp.settings import Feature
-from zbridge.protocol import Codec, Datagram, EncodeError, ProtocolError
+from zbridge.protocol import Codec, Datagram, EncodeError, ProtocolError, Role
 from zbridge.wire import F32, I32, U8, BinaryCodec, Blob, Bool, F32Array, Message, Rest, Text
 
 MAX_FRAME = 4 * 2**20 + 64
@@ -25,14 +25,6 @@ _HEADER_SIZE = HEADER.size
 _LENGTH = struct.Struct("<i").unpack_from
 SERVER_ID = 1
 """The ``id`` byte of every packet from the robot."""
-
-
-class PacketSender(Enum):
-    """Who sends a packet."""
-
-    ROBOT = "robot"
-    HQ = "hq"
-    BOTH = "both"
 
 
 class Carrier(Enum):
@@ -48,19 +40,23 @@ class Packet(Message, frozen=True):
 
     spec: ClassVar[PacketSpec]
 
+    def raw(self) -> tuple[int, bytes]:
+        """Return the packet id and the body; raise EncodeError for values that do not fit."""
+        return self.spec.id, self.spec.codec.encode(self)
+
 
 P = TypeVar("P", bound=Packet)
 
 
 class PacketSpec(msgspec.Struct, frozen=True, eq=False):
-    """A row of the packet table.
+    """A row of the packet table. sender: None if both send it.
 
     features: a robot that announces any of these has registered the packet; none means always.
     """
 
     id: int
     name: str
-    sender: PacketSender
+    sender: Role | None
     carrier: Carrier
     features: tuple[Feature, ...]
     packet: type[Packet]
@@ -72,7 +68,7 @@ PACKETS: dict[int, PacketSpec] = {}
 
 
 def packet(
-    packet_id: int, name: str, sender: PacketSender, carrier: Carrier = Carrier.TCP, needs: tuple[Feature, ...] = ()
+    packet_id: int, name: str, sender: Role | None, carrier: Carrier = Carrier.TCP, needs: tuple[Feature, ...] = ()
 ) -> Callable[[type[P]], type[P]]:
     """Enter a declaration into the packet table."""
 
@@ -88,14 +84,14 @@ _JOYSTICK = (Feature.JOYSTICK,)
 _MAPPING = (Feature.SLAM_MAP, Feature.LIDAR)
 
 
-@packet(1, "debugMessage", PacketSender.BOTH)
+@packet(1, "debugMessage", None)
 class DebugMessage(Packet, frozen=True):
     """A text for people; an empty one crashes legacy robots."""
 
     text: Text
 
 
-@packet(2, "serverSettings", PacketSender.ROBOT)
+@packet(2, "serverSettings", Role.ROBOT)
 class ServerSettings(Packet, frozen=True):
     """The robot speaks first. ``block`` is the settings block of the newest version listed."""
 
@@ -104,7 +100,7 @@ class ServerSettings(Packet, frozen=True):
     block: Rest
 
 
-@packet(3, "clientSettings", PacketSender.HQ)
+@packet(3, "clientSettings", Role.HQ)
 class ClientSettings(Packet, frozen=True):
     """The HQ's answer. ``block`` is the settings block of the newest version listed."""
 
@@ -112,38 +108,38 @@ class ClientSettings(Packet, frozen=True):
     block: Rest
 
 
-@packet(4, "serverStartUDP", PacketSender.ROBOT)
+@packet(4, "serverStartUDP", Role.ROBOT)
 class ServerStartUDP(Packet, frozen=True):
     """The robot waits for the HQ's datagram."""
 
 
-@packet(5, "clientUDPConnection", PacketSender.HQ, Carrier.UDP)
+@packet(5, "clientUDPConnection", Role.HQ, Carrier.UDP)
 class ClientUDPConnection(Packet, frozen=True):
     """The datagram that shows the robot the address of the HQ's socket."""
 
 
-@packet(6, "serverUDPConnection", PacketSender.ROBOT, Carrier.UDP)
+@packet(6, "serverUDPConnection", Role.ROBOT, Carrier.UDP)
 class ServerUDPConnection(Packet, frozen=True):
     """Whether that datagram arrived; comes by UDP if it did, by TCP if not."""
 
     received: Bool
 
 
-@packet(7, "clientUDPConnectionStatus", PacketSender.HQ)
+@packet(7, "clientUDPConnectionStatus", Role.HQ)
 class ClientUDPConnectionStatus(Packet, frozen=True):
     """Whether the robot's datagram arrived."""
 
     connected: Bool
 
 
-@packet(10, "clientControllMode", PacketSender.HQ, needs=_JOYSTICK)
+@packet(10, "clientControllMode", Role.HQ, needs=_JOYSTICK)
 class ClientControllMode(Packet, frozen=True):
     """1 none, 2 joystick, 3 AI."""
 
     mode: I32
 
 
-@packet(11, "clientJoystickMove", PacketSender.HQ, Carrier.UDP_IF_AGREED, needs=_JOYSTICK)
+@packet(11, "clientJoystickMove", Role.HQ, Carrier.UDP_IF_AGREED, needs=_JOYSTICK)
 class ClientJoystickMove(Packet, frozen=True):
     """Move along (x right, y forward), a vector of length 1 at most."""
 
@@ -152,59 +148,59 @@ class ClientJoystickMove(Packet, frozen=True):
     speed: F32
 
 
-@packet(12, "clientJoystickRotate", PacketSender.HQ, Carrier.UDP_IF_AGREED, needs=_JOYSTICK)
+@packet(12, "clientJoystickRotate", Role.HQ, Carrier.UDP_IF_AGREED, needs=_JOYSTICK)
 class ClientJoystickRotate(Packet, frozen=True):
     """Turn on the spot, positive to the right."""
 
     speed: F32
 
 
-@packet(13, "clientJoystickStop", PacketSender.HQ, needs=_JOYSTICK)
+@packet(13, "clientJoystickStop", Role.HQ, needs=_JOYSTICK)
 class ClientJoystickStop(Packet, frozen=True):
     """Stand still."""
 
 
-@packet(21, "clientMoveAI", PacketSender.HQ, needs=_JOYSTICK)
+@packet(21, "clientMoveAI", Role.HQ, needs=_JOYSTICK)
 class ClientMoveAI(Packet, frozen=True):
     """Not defined by the document: opaque."""
 
     body: Rest = b""
 
 
-@packet(31, "serverCamMode", PacketSender.ROBOT)
+@packet(31, "serverCamMode", Role.ROBOT)
 class ServerCamMode(Packet, frozen=True):
     """1 on, 2 off."""
 
     mode: I32
 
 
-@packet(40, "chatMessage", PacketSender.BOTH, needs=(Feature.CHAT,))
+@packet(40, "chatMessage", None, needs=(Feature.CHAT,))
 class ChatMessage(Packet, frozen=True):
     """Not defined by the document: opaque."""
 
     body: Rest = b""
 
 
-@packet(50, "clientLidarMode", PacketSender.HQ, needs=(Feature.LIDAR,))
+@packet(50, "clientLidarMode", Role.HQ, needs=(Feature.LIDAR,))
 class ClientLidarMode(Packet, frozen=True):
     """1 on, 2 off."""
 
     mode: I32
 
 
-@packet(51, "serverLidarStatus", PacketSender.ROBOT)
+@packet(51, "serverLidarStatus", Role.ROBOT)
 class ServerLidarStatus(Packet, frozen=True):
     """1 on, 2 off."""
 
     mode: I32
 
 
-@packet(52, "clientGetSLAMMap", PacketSender.HQ, needs=_MAPPING)
+@packet(52, "clientGetSLAMMap", Role.HQ, needs=_MAPPING)
 class ClientGetSLAMMap(Packet, frozen=True):
     """Ask for the map."""
 
 
-@packet(53, "servertSLAMMap", PacketSender.ROBOT, Carrier.UDP_IF_AGREED)
+@packet(53, "servertSLAMMap", Role.ROBOT, Carrier.UDP_IF_AGREED)
 class ServerSLAMMap(Packet, frozen=True):
     """The map: 0 unknown, 1 free, 2 obstacle, index = x * side + y. Empty: no map yet.
 
@@ -215,12 +211,12 @@ class ServerSLAMMap(Packet, frozen=True):
     cells: Blob = b""
 
 
-@packet(54, "clientGetPosition", PacketSender.HQ, needs=_MAPPING)
+@packet(54, "clientGetPosition", Role.HQ, needs=_MAPPING)
 class ClientGetPosition(Packet, frozen=True):
     """Ask for the position."""
 
 
-@packet(55, "serverPosition", PacketSender.ROBOT, Carrier.UDP_IF_AGREED)
+@packet(55, "serverPosition", Role.ROBOT, Carrier.UDP_IF_AGREED)
 class ServerPosition(Packet, frozen=True):
     """Position in the robot's length unit, heading in degrees."""
 
@@ -229,7 +225,7 @@ class ServerPosition(Packet, frozen=True):
     heading_deg: F32
 
 
-@packet(56, "servertSLAMMapPart", PacketSender.ROBOT, Carrier.UDP_IF_AGREED)
+@packet(56, "servertSLAMMapPart", Role.ROBOT, Carrier.UDP_IF_AGREED)
 class ServerSLAMMapPart(Packet, frozen=True):
     """Cells ``start`` to ``end`` (exclusive) of the map; sent by robots that list "1.4", one a second."""
 
@@ -242,12 +238,12 @@ class ServerSLAMMapPart(Packet, frozen=True):
             raise ProtocolError(f"map part {self.start} to {self.end} with {len(self.cells)} cells")
 
 
-@packet(60, "serverGetSimulatedLidarData", PacketSender.ROBOT)
+@packet(60, "serverGetSimulatedLidarData", Role.ROBOT)
 class ServerGetSimulatedLidarData(Packet, frozen=True):
     """The robot asks for simulated lidar data."""
 
 
-@packet(61, "clientSimulatedLidarData", PacketSender.HQ, Carrier.UDP_IF_AGREED, needs=(Feature.LIDAR_SIM,))
+@packet(61, "clientSimulatedLidarData", Role.HQ, Carrier.UDP_IF_AGREED, needs=(Feature.LIDAR_SIM,))
 class ClientSimulatedLidarData(Packet, frozen=True, eq=False):
     """float32[360] ranges in the robot's length unit, index = degree."""
 
@@ -263,6 +259,9 @@ class OpaquePacket(Packet, frozen=True):
 
     id: int
     body: bytes = b""
+
+    def raw(self) -> tuple[int, bytes]:
+        return self.id, self.body
 
 
 def frame_end(data: bytes, start: int) -> int:
@@ -280,11 +279,8 @@ def encode_packet(message: Packet, sender_id: int, transport: str = "tcp") -> by
 
     Raise EncodeError for values that do not fit.
     """
-    carrier = Carrier.TCP
-    if isinstance(message, OpaquePacket):
-        packet_id, body = message.id, message.body
-    else:
-        packet_id, body, carrier = message.spec.id, message.spec.codec.encode(message), message.spec.carrier
+    packet_id, body = message.raw()
+    carrier = Carrier.TCP if isinstance(message, OpaquePacket) else message.spec.carrier
     try:
         frame = HEADER.pack(2 + len(body), sender_id, packet_id) + body
         return Datagram(frame) if transport == "udp" and carrier is Carrier.UDP_IF_AGREED else frame

@@ -9,12 +9,12 @@ import msgspec
 
 from gateways.tcpudp.session.robot_role import CLIENT_PORT
 from gateways.tcpudp.settings import ANNOUNCED
+from zbridge.protocol import Positive
 
 NAME = "tcpudp"
 
 FeatureName = Literal["udp", "cam", "joystick", "chat", "lidar", "lidar_sim", "slam_map"]
 PacketId = Annotated[int, msgspec.Meta(ge=0, le=255)]
-Scale = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
 Angle = Annotated[float, msgspec.Meta(ge=-7, le=7)]
 Length = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
 
@@ -27,11 +27,11 @@ class TcpUdpOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     force: tuple[FeatureName | PacketId, ...] = ()
     announce: tuple[FeatureName, ...] = tuple(feature.value for feature in ANNOUNCED)
     combine: Literal["exclusive", "both"] = "exclusive"
-    speed_full: Scale = 1.0
-    turn_full: Scale = 1.0
-    length_unit_m: Scale = 0.01
+    speed_full: Positive = 1.0
+    turn_full: Positive = 1.0
+    length_unit_m: Positive = 0.01
     heading_offset: Angle = math.pi / 2
-    map_cell_m: Scale = 0.01
+    map_cell_m: Positive = 0.01
     map_origin: tuple[Length, Length] | None = None
 
 
@@ -51,9 +51,9 @@ class TcpUdpHqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     skip_map_flag: bool = False
     slam_map_size: Annotated[int, msgspec.Meta(ge=1, le=2**31 - 1)] = 1000
     slam_map_interval: Annotated[int, msgspec.Meta(ge=1, le=2**31 - 1)] = 10
-    speed_full: Scale = 1.0
-    turn_full: Scale = 1.0
-    length_unit_m: Scale = 0.01
+    speed_full: Positive = 1.0
+    turn_full: Positive = 1.0
+    length_unit_m: Positive = 0.01
     heading_offset: Angle = math.pi / 2
     map_origin: tuple[Length, Length] | None = None
 

@@ -17,7 +17,7 @@ from gateways.tcpudp import messages as packets
 from gateways.tcpudp.session import limits
 from gateways.tcpudp.session.robot_role import RobotRole
 from gateways.tcpudp.settings import ROBOT_BLOCKS, VERSIONS, Feature, RobotSettings13, Settings
-from zbridge.protocol import ClientIds, Session, Simulation
+from zbridge.protocol import ClientIds, Session
 from zbridge.simulation.simulator import STEP_S, Simulator
 from zbridge.simulation.world import Body, Grid, cast
 from zbridge.transport import Conversation
@@ -201,8 +201,3 @@ class RobotSimulator(Simulator[packets.Packet]):
         for client in self.clients():
             if Feature.LIDAR_SIM.value in client.session.features:
                 self.send(client, part)
-
-
-async def simulate(simulation: Simulation) -> None:
-    """Run a simulated robot until cancelled."""
-    await RobotSimulator(simulation.seed, simulation.version or "1.3", udp=simulation.udp).run(simulation)

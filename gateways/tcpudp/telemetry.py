@@ -12,17 +12,17 @@ from functools import partial
 from typing import Any, ClassVar
 
 from gateways.tcpudp import messages as packets
+from gateways.tcpudp.maps import known_cells
 from gateways.tcpudp.options import NAME, TcpUdpOptions
 from gateways.tcpudp.session.hq_role import HqRole
 from gateways.tcpudp.settings import RobotSettings13, Settings
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Cells, FleetMessage, Map, Pose, Raw, Switch, Text
+from zbridge.fleet.messages import FleetMessage, Map, Pose, Raw, Switch, Text
 from zbridge.protocol import Form, Kept, ProtocolError, Spare, Telemetry, Translate
 
 ON, OFF = 1, 2
 MAX_SIDE = 2048
 """Cells along a side of the largest map that is put together from parts."""
-_OCCUPIED = 2
 _RADIANS = math.pi / 180
 
 
@@ -76,18 +76,8 @@ class TelemetryTranslator(Kept):
     # Packets
 
     def _pose(self, message: packets.ServerPosition, stamp_ns: int) -> tuple[Telemetry, ...]:
-        unit_m = self._unit_m
-        return (
-            (
-                topics.POSE,
-                Pose(
-                    message.x * unit_m,
-                    message.y * unit_m,
-                    message.heading_deg * _RADIANS + self._heading_offset,
-                    stamp_ns=stamp_ns,
-                ),
-            ),
-        )
+        x, y, heading = message.x * self._unit_m, message.y * self._unit_m, message.heading_deg * _RADIANS
+        return ((topics.POSE, Pose(x, y, heading + self._heading_offset, stamp_ns=stamp_ns)),)
 
     def _map(self, message: packets.ServerSLAMMap, stamp_ns: int) -> tuple[Telemetry, ...]:
         """Turn x-major cells (index = x * side + y) into rows of y; cells other than 0, 1, 2 become unknown."""
@@ -98,7 +88,7 @@ class TelemetryTranslator(Kept):
         values = message.cells
         side = _side(len(values), settings)
         cell = self._cell_m(settings)
-        cells = _known_cells(np.frombuffer(values, np.uint8)).reshape(side, side).T
+        cells = known_cells(np.frombuffer(values, np.uint8)).reshape(side, side).T
         half = -side * cell / 2
         origin = self._options.map_origin or (half, half)
         return ((topics.MAP, Map(side, side, cell, origin, cells, stamp_ns=stamp_ns)),)
@@ -137,11 +127,7 @@ class TelemetryTranslator(Kept):
 
     def _raw(self, message: packets.Packet, stamp_ns: int) -> tuple[Telemetry, ...]:
         """Pass on unchanged what no fleet message holds."""
-        if isinstance(message, packets.OpaquePacket):
-            raw = Raw(message.id, message.body, stamp_ns=stamp_ns)
-        else:
-            raw = Raw(message.spec.id, message.spec.codec.encode(message), stamp_ns=stamp_ns)
-        return ((topics.RAW(NAME), raw),)
+        return ((topics.RAW(NAME), Raw(*message.raw(), stamp_ns=stamp_ns)),)
 
 
 def announced_side(settings: Settings | None) -> int:
@@ -161,15 +147,6 @@ def _side(cells: int, settings: Settings | None) -> int:
     if side * side != cells:
         raise ProtocolError(f"map of {cells} cells is not square")
     return side
-
-
-def _known_cells(cells: Cells) -> Cells:
-    """Turn cells other than 0, 1, 2 into unknown."""
-    import numpy as np
-
-    if cells.size == 0 or np.maximum.reduce(cells) <= _OCCUPIED:
-        return cells
-    return np.where(cells <= _OCCUPIED, cells, np.uint8(0))
 
 
 def _switch(mode: int, stamp_ns: int) -> Switch:

@@ -291,27 +291,19 @@ def polar_ranges(scan: Scan, unit_m: float) -> np.ndarray[Any, np.dtype[np.float
     """
     import numpy as np
 
-    with np.errstate(all="ignore"):  # a point with an absurd number counts as not measured
-        return _polar(scan, unit_m)
-
-
-def _polar(scan: Scan, unit_m: float) -> np.ndarray[Any, np.dtype[np.float32]]:
-    import numpy as np
-
     count = len(scan.ranges)
     polar = np.zeros(SCAN_POINTS, np.float32)
     if count == 0 or not scan.angle_increment or not math.isfinite(scan.angle_increment + scan.angle_min):
         return polar
     step = abs(scan.angle_increment)
     circle = 2 * math.pi / step
-    offsets = np.radians(np.arange(SCAN_POINTS)) - scan.angle_min
-    nearest = np.rint(np.mod(math.copysign(1.0, scan.angle_increment) * offsets, 2 * math.pi) / step)
-    nearest = np.where(nearest >= circle - 0.5, 0.0, nearest)  # after the last point comes the first
-    covered = nearest < count
-    indices = nearest[covered].astype(np.int64)
-    ranges = np.asarray(scan.ranges, np.float32)
-    values = ranges[indices]
-    usable = np.isfinite(values) & (values >= scan.range_min) & (values <= scan.range_max)
-    lengths = values / np.float32(unit_m)
-    polar[covered] = np.where(usable & np.isfinite(lengths), lengths, 0)
+    with np.errstate(all="ignore"):  # a point with an absurd number counts as not measured
+        offsets = np.radians(np.arange(SCAN_POINTS)) - scan.angle_min
+        nearest = np.rint(np.mod(math.copysign(1.0, scan.angle_increment) * offsets, 2 * math.pi) / step)
+        nearest = np.where(nearest >= circle - 0.5, 0.0, nearest)  # after the last point comes the first
+        covered = nearest < count
+        values = np.asarray(scan.ranges, np.float32)[nearest[covered].astype(np.int64)]
+        usable = np.isfinite(values) & (values >= scan.range_min) & (values <= scan.range_max)
+        lengths = values / np.float32(unit_m)
+        polar[covered] = np.where(usable & np.isfinite(lengths), lengths, 0)
     return polar

@@ -92,9 +92,9 @@ async def _simulate(simulation: Simulation) -> None:
         controller = FragileWebotsController(dialect.value, seed=simulation.seed)
         await controller.simulate(simulation.addresses, simulation.ready)
     else:
-        from gateways.wc2ec.simulator import simulate
+        from gateways.wc2ec.simulator import ControllerSimulator
 
-        await simulate(simulation)
+        await ControllerSimulator(simulation.seed, dialect).run(simulation)
 
 
 async def _simulate_hq(simulation: HqSimulation) -> None:

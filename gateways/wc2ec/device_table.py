@@ -82,7 +82,6 @@ class DeviceTable(Kept):
         self,
         options: Wc2EcHqOptions,
         view: RobotView,
-        sectors: SectorSensors,
         registered: Callable[[], set[int]],
         unregistered: Count,
     ) -> None:
@@ -92,7 +91,7 @@ class DeviceTable(Kept):
         """The message that registers each device."""
         self._options = options
         self._view = view
-        self._sectors = sectors
+        self.sectors = SectorSensors(options.sectors, options.sector_unit_m)
         self._registered = registered
         self._unregistered = unregistered
         self._dialect = Wc2EcDialect(options.dialect)
@@ -126,10 +125,10 @@ class DeviceTable(Kept):
     def _sector_names(self) -> list[str]:
         """Return the sectors to show, all before the first scan: a controller without sensors is never ready."""
         for geometry in (self._view.scan, self._view.scanner):
-            names = self._sectors.covered(geometry) if geometry is not None else []
+            names = self.sectors.covered(geometry) if geometry is not None else []
             if names:
                 return names
-        return [] if self._view.readings else self._sectors.names
+        return [] if self._view.readings else self.sectors.names
 
     def _forget_gone(self, devices: Iterable[Device]) -> None:
         """Give up the numbers of devices that the robot has no longer and that no controller knows."""

@@ -18,13 +18,20 @@ _SENSOR_KINDS = {37: DISTANCE, 38: DISTANCE}
 
 
 class WebotsDevice(msgspec.Struct, frozen=True):
-    """One device. ``name``: in keys; ``shown``: to people; ``type``: its type byte; ``kind``: what that means."""
+    """One device. ``type``: its type byte; ``kind``: what that means.
+
+    ``name``: in keys; bytes that are not UTF-8 are kept as surrogates.
+    """
 
     name: str
-    shown: str
     number: int
     type: int
     kind: str
+
+    @property
+    def shown(self) -> str:
+        """The name for people."""
+        return self.name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
     @property
     def motor(self) -> bool:
@@ -63,7 +70,7 @@ class RegisteredDevices(Kept):
             self.collisions.append(f"{device.shown!r} is device {taken} and {device.number}")
             suffix = f"#{device.number}"
             while device.name in self._by_name:
-                device = msgspec.structs.replace(device, name=device.name + suffix, shown=device.shown + suffix)
+                device = msgspec.structs.replace(device, name=device.name + suffix)
         self._by_number[device.number] = self._by_name[device.name] = device
         return device
 
@@ -85,18 +92,6 @@ class RegisteredDevices(Kept):
         return Devices(tuple(entries), stamp_ns=stamp_ns)
 
 
-def registered(raw: bytes, number: int, kind_byte: int, kind: str) -> WebotsDevice:
-    """Make a device from a registration; in the key, bytes that are not UTF-8 are kept."""
-    name = raw.decode("utf-8", "surrogateescape")
-    return WebotsDevice(name, raw.decode("utf-8", "backslashreplace"), number, kind_byte, kind)
-
-
-def unnamed(number: int, kind_byte: int, kind: str) -> WebotsDevice:
-    """Make a device without a name: ``<kind>-<number>``."""
-    name = f"{kind}-{number}"
-    return WebotsDevice(name, name, number, kind_byte, kind)
-
-
 def kind_of(kind_byte: int, motor_types: dict[str, tuple[int, ...]]) -> str:
     """Return the kind that a type byte means; motor types come first."""
     for kind, types in motor_types.items():
@@ -114,7 +109,6 @@ def _write_device(device: WebotsDevice) -> list[Any]:
 
 def _read_devices(raw: Any) -> dict[int, WebotsDevice]:
     devices = {}
-    for written, shown, number, kind_byte, kind in msgspec.convert(raw, list[tuple[bytes, str | None, int, int, str]]):
-        name = written.decode("utf-8", "surrogateescape")
-        devices[number] = WebotsDevice(name, name if shown is None else shown, number, kind_byte, kind)
+    for written, _, number, kind_byte, kind in msgspec.convert(raw, list[tuple[bytes, str | None, int, int, str]]):
+        devices[number] = WebotsDevice(written.decode("utf-8", "surrogateescape"), number, kind_byte, kind)
     return devices

@@ -11,21 +11,22 @@ import math
 from collections.abc import Iterable
 from typing import Any, ClassVar
 
-import msgspec
-
-from gateways.wc2ec.device_table import DeviceTable, SectorSensors, ShownDevice
+from gateways.wc2ec.device_table import DeviceTable, ShownDevice
 from gateways.wc2ec.devices import DISTANCE
-from gateways.wc2ec.hq_client import ControllerCommands, Wc2EcClient
-from gateways.wc2ec.messages import MAX_FRAME, SensorData, Wc2EcDialect, Wc2EcMessage, write
+from gateways.wc2ec.hq_client import TRANSLATE, Wc2EcClient
+from gateways.wc2ec.messages import SensorData, Wc2EcDialect, Wc2EcMessage, write
 from gateways.wc2ec.options import Wc2EcHqOptions
 from gateways.wc2ec.translate import NAME
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Devices, FleetMessage, Reading, Scan, Scanner, Status
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
-from zbridge.protocol import ATTEND_S, HqSide, Limits, Metrics, RobotUser, Send, Telemetry
+from zbridge.protocol import ATTEND_S, HqSide, Limits, Metrics, ProtocolError, RobotUser, Send, Telemetry
 
 DEADMAN_S = 0.5
+FAULT = -1.0
+"""What a distance sensor shows when nothing is known: legacy controllers take it as a fault, while anything from
+0 to 1000 would be a false distance ("The gateway as Webots controller")."""
 
 
 class Wc2EcHq(HqSide):
@@ -43,27 +44,25 @@ class Wc2EcHq(HqSide):
         self._draft = self._dialect is Wc2EcDialect.DRAFT
         self.follows = ("scan",) if self._draft else ("scan", "scanner", "devices", "sensor/*")
         self._sessions: list[Wc2EcClient] = []
-        sectors = SectorSensors(options.sectors, options.sector_unit_m)
         left_out = (metrics or Metrics()).count("hq_devices_left_out")
-        self._table = DeviceTable(options, view, sectors, self._registered, left_out)
-        self._display = Wc2EcDisplay(self._dialect, view, self._table, sectors)
-        self._commands = ControllerCommands(options, view, self._table)
+        self._table = DeviceTable(options, view, self._registered, left_out)
+        self._frames: dict[int, tuple[float, bytes]] = {}
+        """The value that was encoded last of each device."""
+        self._readings_gone: dict[str, Reading] = {}
+        self._scan_gone: Scan | None = None
+        """The last readings and scan of a robot that was lost since: they are out of date now."""
 
     # Clients
 
     def session(self, number: int, bounds: Limits) -> Wc2EcClient:
         self._sessions = [session for session in self._sessions if not session.over]
-        session = Wc2EcClient(
-            self._dialect,
-            values=self.options.values,
-            bounds=msgspec.structs.replace(bounds, frame_bytes=MAX_FRAME),
-        )
+        session = Wc2EcClient(self.options, self.view, bounds)
         self._sessions.append(session)
         return session
 
     def begin(self, session: Wc2EcClient, now: float) -> None:
         self._table.learn()
-        self._display.register(session, now)
+        self._register(session, now)
 
     def attend(self, client: RobotUser) -> None:
         """Repeat what a controller set, as it sets a velocity once, until its machine falls silent (``hold``)."""
@@ -77,14 +76,6 @@ class Wc2EcHq(HqSide):
         """Return the numbers of the devices that some controller knows."""
         return set[int]().union(*(session.registered for session in self._sessions if not session.over))
 
-    # What is shown
-
-    def show(self, topic: Topic, message: FleetMessage) -> Send | None:
-        return self._display.show(topic, message)
-
-    def presence(self, there: bool) -> Send | None:
-        return self._display.presence(there)
-
     def wanted(self) -> tuple[Topic, ...]:
         """List the sensors that some controller has enabled; controllers of the draft get no others."""
         if not self._draft:
@@ -95,40 +86,20 @@ class Wc2EcHq(HqSide):
     # What is understood
 
     def take(self, session: Wc2EcClient, message: Wc2EcMessage) -> tuple[Telemetry, ...]:
-        return self._commands.take(session, message)
+        device = self._table.by_number.get(message.number)
+        if device is None:
+            raise ProtocolError(f"device {message.number} is not registered")
+        return TRANSLATE[type(message)](session, device, message)
 
     def deadline(self, session: Wc2EcClient) -> float:
         return session.joined_at
 
     def expire(self, session: Wc2EcClient, now: float) -> tuple[Telemetry, ...]:
-        return self._commands.expire(session, now)
+        return session.joined(now)
 
-
-FAULT = -1.0
-"""What a distance sensor shows when nothing is known: legacy controllers take it as a fault, while anything from
-0 to 1000 would be a false distance ("The gateway as Webots controller")."""
-
-
-class Wc2EcDisplay:
-    """Shows one robot to the controllers of one listener."""
-
-    def __init__(self, dialect: Wc2EcDialect, view: RobotView, table: DeviceTable, sectors: SectorSensors) -> None:
-        self._dialect = dialect
-        self._draft = dialect is Wc2EcDialect.DRAFT
-        self._view = view
-        self._table = table
-        self._sectors = sectors
-        self._frames: dict[int, tuple[float, bytes]] = {}
-        """The value that was encoded last of each device."""
-        self._readings_gone: dict[str, Reading] = {}
-        self._scan_gone: Scan | None = None
-        """The last readings and scan of a robot that was lost since: they are out of date now."""
-
-    def __repr__(self) -> str:
-        return f"<Wc2EcDisplay of {self._table!r}>"
+    # What is shown
 
     def show(self, topic: Topic, message: FleetMessage) -> Send | None:
-        """Encode a message for all controllers; None if there is nothing to show."""
         if isinstance(message, Reading):
             return self._reading(topics.unescape(topic.path.rpartition("/")[2]), message)
         if isinstance(message, Scan):
@@ -136,7 +107,7 @@ class Wc2EcDisplay:
         if isinstance(message, Devices | Scanner | Status):
             before = len(self._table.by_name)
             self._table.learn()
-            return self.register if len(self._table.by_name) > before else None
+            return self._register if len(self._table.by_name) > before else None
         return None
 
     def presence(self, there: bool) -> Send | None:
@@ -144,10 +115,10 @@ class Wc2EcDisplay:
         devices = self._table.by_name.values()
         if there:
             return self._data((device, self._known(device)) for device in devices)
-        self._readings_gone, self._scan_gone = dict(self._view.readings), self._view.scan
+        self._readings_gone, self._scan_gone = dict(self.view.readings), self.view.scan
         return self._data((device, FAULT) for device in devices if device.kind == DISTANCE)
 
-    def register(self, session: Wc2EcClient, now: float) -> None:
+    def _register(self, session: Wc2EcClient, now: float) -> None:
         """Register the devices that the controller does not know yet; a value of each sensor follows at once."""
         table = self._table
         new = [device for device in table.by_number.values() if device.number not in session.registered]
@@ -163,17 +134,17 @@ class Wc2EcDisplay:
         """Return the first value a controller gets of a sensor, which is ready only then; None for a motor."""
         if device.motor:
             return None
-        known = self._known(device) if self._view.missing is None else None
+        known = self._known(device) if self.view.missing is None else None
         return known if known is not None else FAULT if device.kind == DISTANCE else 0.0
 
     def _known(self, device: ShownDevice) -> float | None:
         """Return the last value of a device since the robot is there; None if there is none."""
-        reading, scan = self._view.readings.get(device.name), self._view.scan
+        reading, scan = self.view.readings.get(device.name), self.view.scan
         if reading is not None and reading is not self._readings_gone.get(device.name):
             return _shown(device, reading.value, fault=reading.fault)
-        if scan is None or scan is self._scan_gone or self._view.protocol in (None, NAME):
+        if scan is None or scan is self._scan_gone or self.view.protocol in (None, NAME):
             return None
-        nearest = self._sectors.values(scan).get(device.name)
+        nearest = self._table.sectors.values(scan).get(device.name)
         return None if nearest is None else _shown(device, nearest)
 
     def _reading(self, name: str, message: Reading) -> Send | None:
@@ -181,18 +152,18 @@ class Wc2EcDisplay:
         if name not in table.by_name:
             table.learn()
         device = table.by_name.get(name)
-        if device is None or self._view.missing is not None:
+        if device is None or self.view.missing is not None:
             return None
         return self._data(((device, _shown(device, message.value, fault=message.fault)),))
 
     def _scan(self, scan: Scan) -> Send | None:
         """Show a scan of a robot of another protocol as distance sensors, one for each sector."""
-        if self._view.protocol in (None, NAME) or not len(scan.ranges):
+        if self.view.protocol in (None, NAME) or not len(scan.ranges):
             return None
         self._table.learn()
-        if self._view.missing is not None:
+        if self.view.missing is not None:
             return None
-        shown = [(self._table.by_name.get(name), value) for name, value in self._sectors.values(scan).items()]
+        shown = [(self._table.by_name.get(name), value) for name, value in self._table.sectors.values(scan).items()]
         return self._data((device, _shown(device, value)) for device, value in shown if device is not None)
 
     def _data(self, values: Iterable[tuple[ShownDevice, float | None]]) -> Send | None:
@@ -217,7 +188,7 @@ class Wc2EcDisplay:
     def _queue(self, session: Wc2EcClient, device: ShownDevice, frame: bytes, now: float) -> None:
         """Queue a value as the newest of its device, if the controller wants it."""
         if device.number not in session.registered:
-            self.register(session, now)
+            self._register(session, now)
         if not self._draft or device.number in session.enabled:
             session.outbox.set(f"sensor {device.number}", (frame,), now)
 

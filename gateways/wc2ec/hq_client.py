@@ -10,9 +10,12 @@ import math
 from collections.abc import Callable
 from typing import Any, ClassVar
 
-from gateways.wc2ec.device_table import LEFT, RIGHT, DeviceTable, ShownDevice
+import msgspec
+
+from gateways.wc2ec.device_table import LEFT, RIGHT, ShownDevice
 from gateways.wc2ec.devices import LINEAR, ROTATIONAL
 from gateways.wc2ec.messages import (
+    MAX_FRAME,
     ChangeSensor,
     DisableSensor,
     EnableSensor,
@@ -24,13 +27,19 @@ from gateways.wc2ec.messages import (
 from gateways.wc2ec.options import Wc2EcHqOptions
 from gateways.wc2ec.session import ControllerRole
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Drive, Motor, SensorSetting
+from zbridge.fleet.messages import Motor, SensorSetting
 from zbridge.fleet.view import RobotView
 from zbridge.protocol import Limits, ProtocolError, Telemetry
 
+_MOST = 1e9
+Commands = tuple[Telemetry, ...]
+
 
 class Wc2EcClient(ControllerRole):
-    """One controller: which devices it knows, which it enabled (draft), and how it set the two wheels."""
+    """One controller: which devices it knows, which it enabled (draft), and how it set the two wheels.
+
+    Translates its messages, which raise ProtocolError where they have no meaning.
+    """
 
     kept: ClassVar[dict[str, Any]] = {
         "registered": set[int],
@@ -42,8 +51,11 @@ class Wc2EcClient(ControllerRole):
     }
     handled = frozenset({SetValue})
 
-    def __init__(self, dialect: Wc2EcDialect, *, values: int, bounds: Limits) -> None:
-        super().__init__(dialect, values=values, bounds=bounds)
+    def __init__(self, options: Wc2EcHqOptions, view: RobotView, bounds: Limits) -> None:
+        bounds = msgspec.structs.replace(bounds, frame_bytes=MAX_FRAME)
+        super().__init__(Wc2EcDialect(options.dialect), values=options.values, bounds=bounds)
+        self._options = options
+        self._view = view
         self.registered: set[int] = set()
         self.enabled: set[int] = set()
         self.wheels = {LEFT: 0.0, RIGHT: 0.0}
@@ -58,52 +70,34 @@ class Wc2EcClient(ControllerRole):
         self.received_at = now
         return super().accept(message, now)
 
-
-_MOST = 1e9
-
-
-class ControllerCommands:
-    """Translates the messages of one listener's controllers."""
-
-    def __init__(self, options: Wc2EcHqOptions, view: RobotView, table: DeviceTable) -> None:
-        self._options = options
-        self._view = view
-        self._table = table
-
-    def __repr__(self) -> str:
-        return f"<ControllerCommands to {self._table!r}>"
-
-    def take(self, session: Wc2EcClient, message: Wc2EcMessage) -> tuple[Telemetry, ...]:
-        """Translate a message; raise ProtocolError if it has no meaning."""
-        device = self._table.by_number.get(message.number)
-        if device is None:
-            raise ProtocolError(f"device {message.number} is not registered")
-        return _TRANSLATE[type(message)](self, session, device, message)
-
-    def expire(self, session: Wc2EcClient, now: float) -> tuple[Telemetry, ...]:
+    def joined(self, now: float) -> Commands:
         """Drive with the wheels as they are set, if ``join_s`` is over."""
-        return self._joined(session) if now >= session.joined_at else ()
+        if now < self.joined_at:
+            return ()
+        self.fresh.clear()
+        self.joined_at = math.inf
+        if self._has_motors:
+            return ()
+        wheels = self._options.wheels
+        sides_m_s = (wheels.wheel_radius_m * self.wheels[side] for side in (LEFT, RIGHT))
+        return ((topics.CMD_DRIVE, wheels.drive(*sides_m_s)),)
 
-    def _set(self, session: Wc2EcClient, device: ShownDevice, message: SetValue) -> tuple[Telemetry, ...]:
+    def set_motor(self, device: ShownDevice, message: SetValue) -> Commands:
+        """Set a motor; one of the two wheels waits for the other."""
         if not device.motor:
             raise ProtocolError(f"device {device.number} ({device.name!r}) is no motor")
         if not abs(message.value) <= _MOST:
             raise ProtocolError(f"{message.value} is no value of a motor")
         if self._has_motors:
             return ((topics.CMD_MOTOR(device.name), Motor(message.value)),)
-        if device.name not in session.wheels:
+        if device.name not in self.wheels:
             raise ProtocolError(f"the robot has no motor {device.name!r} any more")
-        session.wheels[device.name] = message.value
-        session.fresh.add(device.name)
-        if session.fresh == session.wheels.keys() or not any(session.wheels.values()):
-            return self._joined(session)
-        session.joined_at = min(session.joined_at, session.received_at + self._options.join_s)
-        return self.expire(session, session.received_at)
-
-    def _joined(self, session: Wc2EcClient) -> tuple[Telemetry, ...]:
-        session.fresh.clear()
-        session.joined_at = math.inf
-        return () if self._has_motors else ((topics.CMD_DRIVE, self._drive(**session.wheels)),)
+        self.wheels[device.name] = message.value
+        self.fresh.add(device.name)
+        whole = self.fresh == self.wheels.keys() or not any(self.wheels.values())
+        join_s = 0.0 if whole else self._options.join_s
+        self.joined_at = min(self.joined_at, self.received_at + join_s)
+        return self.joined(self.received_at)
 
     @property
     def _has_motors(self) -> bool:
@@ -111,39 +105,37 @@ class ControllerCommands:
         devices = self._view.devices.devices if self._view.devices is not None else ()
         return any(device.kind in (ROTATIONAL, LINEAR) for device in devices)
 
-    def _drive(self, left: float, right: float) -> Drive:
-        """Convert the velocities of two sides, rad/s, to a drive; both parts are scaled down if one exceeds 1."""
-        wheels = self._options.wheels
-        return wheels.drive(wheels.wheel_radius_m * left, wheels.wheel_radius_m * right)
 
-    def _enable(self, session: Wc2EcClient, device: ShownDevice, message: EnableSensor) -> tuple[Telemetry, ...]:
-        session.enabled.add(device.number)
-        return ()
-
-    def _disable(self, session: Wc2EcClient, device: ShownDevice, message: DisableSensor) -> tuple[Telemetry, ...]:
-        session.enabled.discard(device.number)
-        session.outbox.clear(f"sensor {device.number}")
-        return ()
-
-    def _change(self, session: Wc2EcClient, device: ShownDevice, message: ChangeSensor) -> tuple[Telemetry, ...]:
-        return _setting(device, SensorSetting(index=message.index, value=message.value), message.value)
-
-    def _configure(self, session: Wc2EcClient, device: ShownDevice, message: SetSensor) -> tuple[Telemetry, ...]:
-        values = tuple(message.values.tolist())
-        return _setting(device, SensorSetting(values=values), *values)
+def _enable(client: Wc2EcClient, device: ShownDevice, message: EnableSensor) -> Commands:
+    client.enabled.add(device.number)
+    return ()
 
 
-def _setting(device: ShownDevice, setting: SensorSetting, *values: float) -> tuple[Telemetry, ...]:
+def _disable(client: Wc2EcClient, device: ShownDevice, message: DisableSensor) -> Commands:
+    client.enabled.discard(device.number)
+    client.outbox.clear(f"sensor {device.number}")
+    return ()
+
+
+def _change(client: Wc2EcClient, device: ShownDevice, message: ChangeSensor) -> Commands:
+    return _setting(device, SensorSetting(index=message.index, value=message.value), message.value)
+
+
+def _configure(client: Wc2EcClient, device: ShownDevice, message: SetSensor) -> Commands:
+    values = tuple(message.values.tolist())
+    return _setting(device, SensorSetting(values=values), *values)
+
+
+def _setting(device: ShownDevice, setting: SensorSetting, *values: float) -> Commands:
     if not all(map(math.isfinite, values)):
         raise ProtocolError(f"{values} to sensor {device.number}: no numbers")
     return ((topics.CMD_SENSOR(device.name), setting),)
 
 
-_Translate = Callable[[ControllerCommands, Wc2EcClient, ShownDevice, Any], tuple[Telemetry, ...]]
-_TRANSLATE: dict[type[Wc2EcMessage], _Translate] = {
-    SetValue: ControllerCommands._set,
-    EnableSensor: ControllerCommands._enable,
-    DisableSensor: ControllerCommands._disable,
-    ChangeSensor: ControllerCommands._change,
-    SetSensor: ControllerCommands._configure,
+TRANSLATE: dict[type[Wc2EcMessage], Callable[[Wc2EcClient, ShownDevice, Any], Commands]] = {
+    SetValue: Wc2EcClient.set_motor,
+    EnableSensor: _enable,
+    DisableSensor: _disable,
+    ChangeSensor: _change,
+    SetSensor: _configure,
 }

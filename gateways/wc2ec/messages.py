@@ -13,7 +13,7 @@ from typing import Annotated, ClassVar, TypeVar
 
 import msgspec
 
-from zbridge.protocol import Codec, ProtocolError
+from zbridge.protocol import Codec, ProtocolError, Role
 from zbridge.wire import F64, U8, BinaryCodec, F64Fill, Message
 from zbridge.wire.fields import CountedBytes
 from zbridge.wire.frames import FrameEnd
@@ -29,13 +29,6 @@ class Wc2EcDialect(Enum):
 
     DRAFT = "draft"
     DEPLOYED = "deployed"
-
-
-class Wc2EcSender(Enum):
-    """Who sends a message: the Webots controller or the external one."""
-
-    WC = "Webots controller"
-    EC = "external controller"
 
 
 class Wc2EcMessage(Message, frozen=True):
@@ -60,9 +53,9 @@ class Wc2EcSpec(msgspec.Struct, frozen=True, eq=False):
     codec: BinaryCodec[Wc2EcMessage]
 
     @property
-    def sender(self) -> Wc2EcSender:
-        """Who sends it, by its command."""
-        return Wc2EcSender.WC if self.command in FROM_CONTROLLER else Wc2EcSender.EC
+    def sender(self) -> Role:
+        """Who sends it, by its command: the Webots controller is the robot."""
+        return Role.ROBOT if self.command in FROM_CONTROLLER else Role.HQ
 
 
 MESSAGES: dict[Wc2EcDialect, dict[int, Wc2EcSpec]] = {dialect: {} for dialect in Wc2EcDialect}
@@ -132,14 +125,14 @@ class SetValue(Wc2EcMessage, frozen=True):
     value: F64
 
 
-def frame_end(dialect: Wc2EcDialect, sender: Wc2EcSender, *, values: int = 0) -> FrameEnd:
+def frame_end(dialect: Wc2EcDialect, sender: Role, *, values: int = 0) -> FrameEnd:
     """Make the framing function for what one side sends. ``values``: configuration values of a sensor.
 
     A command that the side cannot send breaks the stream: its length is unknown.
     """
     specs = {command: spec for command, spec in MESSAGES[dialect].items() if spec.sender is sender}
     sizes = {command: 1 + spec.codec.fixed_size for command, spec in specs.items()}
-    registration = RegisterSensor.commands.get(dialect) if sender is Wc2EcSender.WC else None
+    registration = RegisterSensor.commands.get(dialect) if sender is Role.ROBOT else None
     if (setting := SetSensor.commands.get(dialect)) in sizes:
         sizes[setting] += 8 * values
 
@@ -148,9 +141,7 @@ def frame_end(dialect: Wc2EcDialect, sender: Wc2EcSender, *, values: int = 0) ->
         size = sizes.get(command)
         if size is None:
             half = (
-                ""
-                if (command in FROM_CONTROLLER) is (sender is Wc2EcSender.WC)
-                else ", which is of the other side's half"
+                "" if (command in FROM_CONTROLLER) is (sender is Role.ROBOT) else ", which is of the other side's half"
             )
             quoted = data[start : start + _QUOTED].hex(" ")
             raise ProtocolError(f"command {command}{half}, expected one of {sorted(sizes)}: {quoted}")
@@ -177,12 +168,12 @@ def codecs() -> tuple[Codec, ...]:
     """List the messages of both dialects and both sides for the conformance kit; a sensor has two values."""
     return tuple(
         Codec(
-            f"{dialect.value}, {sender.value}",
+            f"{dialect.value}, {name}",
             partial(write, dialect=dialect),
             partial(read, dialect=dialect),
             frame_end(dialect, sender, values=2),
             tuple(spec.message for spec in MESSAGES[dialect].values() if spec.sender is sender),
         )
         for dialect in Wc2EcDialect
-        for sender in Wc2EcSender
+        for name, sender in (("Webots controller", Role.ROBOT), ("external controller", Role.HQ))
     )

@@ -15,7 +15,6 @@ from gateways.wc2ec.messages import (
     SensorData,
     Wc2EcDialect,
     Wc2EcMessage,
-    Wc2EcSender,
     frame_end,
     read,
     write,
@@ -35,11 +34,10 @@ class Wc2EcSession(Session[Wc2EcMessage]):
     bounds: what a listener demands of its clients.
     """
 
-    _PEER: Wc2EcSender
-
     def __init__(self, dialect: Wc2EcDialect, *, values: int = 0, bounds: Limits = _BOUNDS) -> None:
         self.dialect = dialect
-        self.frame_end = frame_end(dialect, self._PEER, values=values)
+        peer = Role.ROBOT if self.role is Role.HQ else Role.HQ
+        self.frame_end = frame_end(dialect, peer, values=values)
         super().__init__(bounds)
 
     def encode(self, message: Wc2EcMessage) -> bytes:
@@ -59,7 +57,6 @@ class ExternalRole(Wc2EcSession):
 
     kept: ClassVar[dict[str, Any]] = {"_settled_at": float}
     role = Role.HQ
-    _PEER = Wc2EcSender.WC
 
     def __init__(self, dialect: Wc2EcDialect) -> None:
         super().__init__(dialect)
@@ -97,7 +94,6 @@ class ControllerRole(Wc2EcSession):
     """We play the Webots controller towards an external one."""
 
     role = Role.ROBOT
-    _PEER = Wc2EcSender.EC
 
     def opened(self, now: float) -> None:
         self.establish("", ())

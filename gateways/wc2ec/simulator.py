@@ -24,7 +24,6 @@ from gateways.wc2ec.messages import (
     Wc2EcMessage,
 )
 from gateways.wc2ec.session import ControllerRole
-from zbridge.protocol import Simulation
 from zbridge.simulation.simulator import STEP_S, Simulator
 from zbridge.simulation.world import Body, cast
 from zbridge.transport import Conversation
@@ -131,8 +130,3 @@ class ControllerSimulator(Simulator[Wc2EcMessage]):
     def step(self, steps: int) -> None:
         self.machine.step(STEP_S)
         self.tell(*(self.machine.distances() if self._dialect is Wc2EcDialect.DEPLOYED else self.machine.lights()))
-
-
-async def simulate(simulation: Simulation) -> None:
-    """Run a simulated robot until cancelled."""
-    await ControllerSimulator(simulation.seed, Wc2EcDialect(simulation.dialect or "deployed")).run(simulation)

@@ -20,8 +20,6 @@ from gateways.wc2ec.devices import (
     RegisteredDevices,
     WebotsDevice,
     kind_of,
-    registered,
-    unnamed,
 )
 from gateways.wc2ec.options import Wc2EcOptions
 from gateways.wc2ec.session import ExternalRole
@@ -85,14 +83,11 @@ class Wc2EcRobot(RobotSide):
     def session(self, link: str, peer: str) -> ExternalRole:
         self.driving = ExternalRole(self._dialect)
         self._table = RegisteredDevices()
-        self._ring = self._new_ring()
+        bearings_deg = self.options.bearings_deg
+        self._ring = BearingScan(bearings_deg, self.options.scan_range_m) if bearings_deg else None
         for option in self.options.devices if self._dialect is messages.Wc2EcDialect.DRAFT else ():
-            self._table.add(WebotsDevice(option.name, option.name, option.number, 0, option.kind))
+            self._table.add(WebotsDevice(option.name, option.number, 0, option.kind))
         return self.driving
-
-    def _new_ring(self) -> BearingScan | None:
-        options = self.options
-        return BearingScan(options.bearings_deg, options.scan_range_m) if options.bearings_deg else None
 
     def begun(self, stamp_ns: int) -> tuple[Telemetry, ...]:
         if self._dialect is messages.Wc2EcDialect.DRAFT:
@@ -122,13 +117,15 @@ class Wc2EcRobot(RobotSide):
 
     def _registration(self, message: messages.RegisterSensor, stamp_ns: int) -> tuple[Telemetry, ...]:
         kind = kind_of(message.kind, self._motor_types)
-        device = registered(message.name, message.number, message.kind, kind)
+        device = WebotsDevice(message.name.decode("utf-8", "surrogateescape"), message.number, message.kind, kind)
         for motor, names in self._motor_names.items():
             if device.name in names:
                 device = msgspec.structs.replace(device, kind=motor)
         entered = self._table.add(device)
         if entered is None:
             raise ProtocolError(f"device {message.number} registered again, as {device.shown!r}")
+        if entered.kind == ROTATIONAL and self.ready:  # not known when the robot was stopped: one read may bring all
+            self._set_motor(entered, 0.0, 0.0, urgent=True)
         shown: list[Telemetry] = [(topics.DEVICES, self._table.message(stamp_ns))]
         if entered.name != device.name:
             text = f"{self._table.collisions[-1]}: the second is shown as {entered.shown!r}"
@@ -140,7 +137,7 @@ class Wc2EcRobot(RobotSide):
         if device is None:
             self._unregistered.value += 1
             kind = LIGHT if self._dialect is messages.Wc2EcDialect.DRAFT else kind_of(message.kind, self._motor_types)
-            device = unnamed(message.number, message.kind, kind)
+            device = WebotsDevice(f"{kind}-{message.number}", message.number, message.kind, kind)
         options, name = self.options, device.name
         value = message.value
         low, high = options.bounds.get(name) or options.bounds_default or (-math.inf, math.inf)

@@ -31,13 +31,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gateways.alf.messages import AlfSender, Measurement, ScannerInit, read_text, sent_by
+from gateways.alf.messages import Measurement, ScannerInit, read_text, sent_by
 from gateways.alf.translate import ranges_m
 from tests.benchmarks import alf_wire
 from tests.benchmarks.alf_flow import COMMANDS_HZ, SCANS_HZ, saturated, steady
 from tests.benchmarks.flow import Route, Run
 from tests.benchmarks.gateway import head
 from tests.benchmarks.harness import Spread, pairs
+from zbridge.protocol.session import Role
 
 ROUNDS = 25
 """Turns of decoding; each of both sides takes the fastest of three repetitions."""
@@ -90,7 +91,7 @@ def decoding(count: int) -> list[Figure]:
     head("a text scan, 769 points, to float32 metres", "us: codec and ranges_m, np.fromstring of the same bytes, ratio")
     frame = alf_wire.scan("text", 12_345, 1_234_567)
     body = frame[2:-1]
-    ids = sent_by(AlfSender.VEHICLE)
+    ids = sent_by(Role.ROBOT)
     scanner = read_text(alf_wire.geometry("text"), ids)
     assert isinstance(scanner, ScannerInit)
 

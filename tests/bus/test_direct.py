@@ -13,8 +13,8 @@ import zenoh
 
 from tests.bus import SOON_S, Seen
 from tests.e2e.conftest import free_port
-from zbridge.bus import BusSettings, Sample
-from zbridge.bus.zenoh import ZenohBus, declared, open_zenoh, zenoh_config
+from zbridge.bus import BusSettings, Sample, open_bus
+from zbridge.bus.zenoh import ZenohBus, declared, zenoh_config
 from zbridge.metrics import Metrics
 
 COUNT = 200
@@ -28,7 +28,7 @@ def port() -> int:
 
 @pytest.fixture
 async def bus(port: int) -> AsyncIterator[ZenohBus]:
-    opened = await open_zenoh(BusSettings(multicast=False, listen=(f"tcp/127.0.0.1:{port}",)), Metrics(), threads=False)
+    opened = await open_bus(BusSettings(multicast=False, listen=(f"tcp/127.0.0.1:{port}",)), Metrics(), threads=False)
     yield opened
     await opened.close()
 

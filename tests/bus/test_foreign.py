@@ -9,14 +9,14 @@ import zenoh.ext
 
 from tests.bus import SOON_S, Seen
 from tests.ports import free_port
-from zbridge.bus import BusSettings, IncomingQuery
-from zbridge.bus.zenoh import ZenohBus, open_zenoh, zenoh_config
+from zbridge.bus import BusSettings, IncomingQuery, open_bus
+from zbridge.bus.zenoh import ZenohBus, zenoh_config
 from zbridge.metrics import Metrics
 
 
 async def opened(port: int) -> ZenohBus:
     settings = BusSettings(mode="peer", multicast=False, listen=(f"tcp/127.0.0.1:{port}",))
-    return await open_zenoh(settings, Metrics(), timestamps=True)
+    return await open_bus(settings, Metrics(), timestamps=True)
 
 
 def stranger(port: int) -> zenoh.Session:

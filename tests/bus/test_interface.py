@@ -8,8 +8,7 @@ import pytest
 
 from tests.bus import Seen
 from tests.fake_bus import FakeBus
-from zbridge.bus import Bus, BusSettings, IncomingQuery
-from zbridge.bus.zenoh import open_zenoh
+from zbridge.bus import Bus, BusSettings, IncomingQuery, open_bus
 from zbridge.errors import Held
 from zbridge.fleet import topics
 from zbridge.metrics import Metrics
@@ -18,7 +17,7 @@ from zbridge.metrics import Metrics
 @pytest.fixture(params=["zenoh", "fake"])
 async def bus(request: pytest.FixtureRequest) -> AsyncIterator[Bus]:
     alone = BusSettings(multicast=False, listen=("tcp/127.0.0.1:0",))
-    opened: Bus = FakeBus() if request.param == "fake" else await open_zenoh(alone, Metrics())
+    opened: Bus = FakeBus() if request.param == "fake" else await open_bus(alone, Metrics())
     yield opened
     await opened.close()
 

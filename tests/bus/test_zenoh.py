@@ -16,8 +16,8 @@ import zenoh
 
 from tests.bus import SOON_S, Seen
 from tests.ports import free_port
-from zbridge.bus import BusSettings, PriorityClass, ReadPayload
-from zbridge.bus.zenoh import ZenohBus, declared, incoming, open_zenoh, publishers, session, zenoh_config
+from zbridge.bus import BusSettings, PriorityClass, ReadPayload, open_bus
+from zbridge.bus.zenoh import ZenohBus, declared, incoming, publishers, session, zenoh_config
 from zbridge.errors import BusError, Code, Held, Refused, Unsupported
 from zbridge.fleet import topics
 from zbridge.metrics import Metrics
@@ -28,7 +28,7 @@ ALONE = BusSettings(multicast=False, listen=("tcp/127.0.0.1:0",))
 
 @pytest.fixture
 async def bus() -> AsyncIterator[ZenohBus]:
-    opened = await open_zenoh(ALONE, Metrics())
+    opened = await open_bus(ALONE, Metrics())
     yield opened
     await opened.close()
 
@@ -200,7 +200,7 @@ async def test_streams_above_the_first_ones_are_published_all_the_same_and_leave
 
 
 async def test_what_waits_to_be_written_without_loss_is_written_before_its_key_is_given_up() -> None:
-    bus = await open_zenoh(BusSettings(multicast=False, listen=("tcp/127.0.0.1:0",), stream="block"), Metrics())
+    bus = await open_bus(BusSettings(multicast=False, listen=("tcp/127.0.0.1:0",), stream="block"), Metrics())
     try:
         seen, go = Seen(), threading.Event()
         bus.subscribe("fleet/r1/sensor/*", lambda sample: seen.take(sample.payload))
@@ -233,7 +233,7 @@ async def test_what_was_closed_is_forgotten(bus: ZenohBus, monkeypatch: pytest.M
 async def test_questions_beyond_the_rate_are_not_answered_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(incoming, "QUERIES_HZ", 2.0)
     metrics = Metrics()
-    bus = await open_zenoh(ALONE, metrics)
+    bus = await open_bus(ALONE, metrics)
     bus.answer("fleet/r1/@rpc/pose", lambda question: question.answer(b"yes"))
     answers = await asyncio.gather(*(bus.ask("fleet/r1/@rpc/pose", timeout_s=SOON_S) for _ in range(50)))
     assert 2 <= sum(map(len, answers)) < 50
@@ -253,7 +253,7 @@ REPORT = "fleet/r1/@rpc/control/refused/hq.desk"
 
 async def test_what_is_too_large_for_its_key_is_dropped_before_anybody_is_called() -> None:
     where = (f"tcp/127.0.0.1:{free_port()}",)
-    gateway = await open_zenoh(BusSettings(multicast=False, listen=where), Metrics(), bounds=topics.size_bounds())
+    gateway = await open_bus(BusSettings(multicast=False, listen=where), Metrics(), bounds=topics.size_bounds())
     sender = await asyncio.to_thread(zenoh.open, zenoh_config(BusSettings(multicast=False, connect=where)))
     seen, called = Seen(), list[tuple[str, int]]()
 

@@ -11,8 +11,8 @@ import pytest
 import zenoh
 
 from tests.ports import free_port
-from zbridge.bus import BusSettings, Sample
-from zbridge.bus.zenoh import ZenohBus, open_zenoh
+from zbridge.bus import BusSettings, Sample, open_bus
+from zbridge.bus.zenoh import ZenohBus
 from zbridge.fleet import topics
 from zbridge.metrics import Metrics
 
@@ -41,7 +41,7 @@ def router(endpoint: str) -> zenoh.Session:
 @contextlib.asynccontextmanager
 async def client(endpoint: str) -> AsyncIterator[ZenohBus]:
     settings = BusSettings(mode="client", multicast=False, connect=(endpoint,))
-    bus = await open_zenoh(settings, Metrics())
+    bus = await open_bus(settings, Metrics())
     try:
         yield bus
     finally:

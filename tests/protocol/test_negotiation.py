@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zbridge.protocol.negotiation import agree, parse_versions
+from zbridge.protocol.handshake import agree, parse_versions
 
 
 @pytest.mark.parametrize(

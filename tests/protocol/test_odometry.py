@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from zbridge.protocol.odometry import Odometry
+from zbridge.protocol.kinematics import Odometry
 
 
 def test_the_first_positions_are_the_origin_and_a_restart_goes_on_from_where_the_robot_was() -> None:

@@ -79,7 +79,7 @@ def play(session: Any, script: str, **verbs: Callable[[str, float], Any]) -> Non
         "send": lambda word, now: session.send(word.encode()),
         "urgent": lambda word, now: session.outbox.set("motion", (framed(word),), now, until=now, urgent=True),
         "close": lambda why, now: session.close(why, now),
-        "lost": lambda why, now: session.lost(why),
+        "lost": lambda why, now: session.fail(why),
         "hear": lambda words, now: b" ".join(session.receive(b"".join(map(framed, words.split())), now)).decode(),
         "out": lambda _, now: (session.outgoing(now) or framed("nothing")).decode(),
         "due": lambda _, now: f"{session.deadline():g}" if session.deadline() is not None else "never",
@@ -193,7 +193,7 @@ def test_a_tap_is_shown_every_frame_of_both_directions_malformed_ones_too(sessio
     assert shown == [("in", b"\x01a"), ("in", b"\x01?"), ("out", b"\x01b")]
 
 
-@pytest.mark.parametrize("end", [lambda toy: toy.close("enough", 1.0), lambda toy: toy.lost("enough")])
+@pytest.mark.parametrize("end", [lambda toy: toy.close("enough", 1.0), lambda toy: toy.fail("enough")])
 def test_a_session_says_why_its_peer_must_not_be_moved_two_doubts_and_not_one_and_why_it_ended(session, end) -> None:
     session.establish("", ())
     session.busy = "handshaking"

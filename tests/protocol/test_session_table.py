@@ -14,7 +14,7 @@ def test_a_session_shows_in_the_table_as_it_is_now_and_is_remembered_as_it_ended
     table.add(second)
     first.open(0.0)
     assert [shown.state for shown in table.snapshots()] == ["handshaking", "connecting"]
-    first.lost("closed by peer")
+    first.fail("closed by peer")
     for removed in (first, first, Toy(LIMITS, name="stranger")):
         table.remove(removed)
     first.name = "changed"

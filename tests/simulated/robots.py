@@ -254,7 +254,7 @@ class TcpUdpRobot(SimRobot):
         if 4 + int.from_bytes(data[:4], "little", signed=True) != len(data):
             self.crash("a datagram whose length field is wrong")
             return
-        end = next((each for each in self.ends if each.peer.address[0] == source[0]), None)
+        end = next((each for each in reversed(self.ends) if each.peer.address[0] == source[0]), None)
         if end is None:
             return
         if data[5] == 5:

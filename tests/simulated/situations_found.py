@@ -148,7 +148,7 @@ def _stop_while_away(rng: random.Random, made: Made) -> None:
     """Somebody stops a robot that its gateway cannot reach, and tries to."""
     client(made)
     made["drivers"][1] |= {"options": {}, "router": "router1"}
-    cut = fault(3.0, "cut", between=["robot", "gw1"], both=True) | {"for": 40.0}
+    cut = fault(3.0, "cut", between=["robot", "gw1"], both=True) | {"for": 30.5}
     reset = fault(3.1, "reset", between=["robot", "gw1"])
     stops = [{"t": 10.0 + 2.0 * number + rng.random(), "who": "op2", "do": "stop"} for number in range(12)]
     made["steps"] = [cut, reset, *stops]

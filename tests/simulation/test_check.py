@@ -207,7 +207,7 @@ TRANSLATED = "messages of the robot are translated"
             ),
             {SILENCE: "still handshaking after 6 s"},
         ),
-        (with_session(lost=lambda self, reason: None), {END: "still does something"}),
+        (with_session(fail=lambda self, reason: None), {END: "still does something"}),
         (with_session(timers=lambda self: 0.0), {"what the robot said establishes a session": "writes and timers"}),
         (with_robot(pose=lambda self, message, stamp_ns: {}[message.x]), {TRANSLATED: "KeyError", GARBAGE: "KeyError"}),
         (with_robot(pose=lambda *_: ((topics.POSE, Switch(on=True)),)), {TRANSLATED: "PayloadError"}),

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import re
-from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from ssl import SSLContext
@@ -124,13 +123,13 @@ def plan(raw: dict[str, Any], environment: Mapping[str, str] = os.environ) -> Ga
         raise ConfigError("device: missing, it is required without [[hq]]")
     device = _device(config.device) if config.device is not None else None
     listeners = tuple(_listener(settings, f"hq[{number}]") for number, settings in enumerate(config.hq))
-    named = Counter(settings.name for settings in config.hq if settings.name is not None)
-    for number, settings in enumerate(config.hq):
-        if settings.name is not None and named[settings.name] > 1:
-            raise ConfigError(f"hq[{number}].name = {settings.name!r}: expected a name of its own")
-    taken = Counter(_port(listener.address) for listener in listeners if listener.address.port)
-    for number, listener in enumerate(listeners):
-        if taken[_port(listener.address)] > 1:
+    names = [settings.name for settings in config.hq]
+    for number, own in enumerate(names):
+        if own is not None and names.count(own) > 1:
+            raise ConfigError(f"hq[{number}].name = {own!r}: expected a name of its own")
+    ports = [(listener.address.host, listener.address.port) for listener in listeners]
+    for number, at in enumerate(ports):
+        if at[1] and ports.count(at) > 1:
             raise ConfigError(f"hq[{number}].listen = {config.hq[number].listen!r}: expected an address of its own")
     metrics = _metrics_address(config.metrics.listen) if config.metrics else None
     camera = plan_camera(config.camera) if config.camera is not None else None
@@ -165,10 +164,6 @@ def _listener(settings: HqSettings, key: str) -> ListenerPlan:
     with prefixed(f"{key}.listen = ", LinkError):
         address = Address.parse_listener(settings.listen)
     return ListenerPlan(protocol, options, address, settings, allow, _listener_tls(key, settings, address))
-
-
-def _port(address: Address) -> tuple[str, int]:
-    return address.host, address.port
 
 
 def _listener_tls(key: str, settings: HqSettings, address: Address) -> SSLContext | None:

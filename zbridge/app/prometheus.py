@@ -15,7 +15,8 @@ from collections.abc import AsyncIterator, Callable, Sequence
 
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
-from zbridge.transport.waiting import waiting_sockets
+from zbridge.tasks import Tasks
+from zbridge.transport.door import waiting_sockets
 
 log = logging.getLogger("zbridge.metrics")
 
@@ -53,13 +54,13 @@ async def serve_metrics(
         yield []
         return
     clients: Clients = {}
-    tasks = [asyncio.create_task(_accept(each, clients, metrics, missing)) for each in sockets]
+    accepting = Tasks()
+    for each in sockets:
+        accepting.start(_accept(each, clients, metrics, missing))
     try:
         yield sockets
     finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await accepting.end()
         for listening in sockets:
             listening.close()
 

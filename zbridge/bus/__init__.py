@@ -10,48 +10,25 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from zbridge.bus.interface import (
-    Answer,
-    Batch,
-    Bus,
-    BusSettings,
-    Handle,
-    IncomingQuery,
-    Neighbour,
-    PriorityClass,
-    Publisher,
-    ReadPayload,
-    Sample,
-    Sort,
-    Tls,
-)
+from zbridge.bus.interface import Answer as Answer
+from zbridge.bus.interface import Batch as Batch
+from zbridge.bus.interface import Bus as Bus
+from zbridge.bus.interface import BusSettings as BusSettings
+from zbridge.bus.interface import Handle as Handle
+from zbridge.bus.interface import IncomingQuery as IncomingQuery
+from zbridge.bus.interface import Neighbour as Neighbour
+from zbridge.bus.interface import PriorityClass as PriorityClass
+from zbridge.bus.interface import Publisher as Publisher
+from zbridge.bus.interface import ReadPayload as ReadPayload
+from zbridge.bus.interface import Sample as Sample
+from zbridge.bus.interface import Sort as Sort
+from zbridge.bus.interface import Tls as Tls
 from zbridge.errors import ConfigError
 from zbridge.fleet.topics import SizeBounds
 from zbridge.metrics import Metrics
 
 OPEN_S = 1.0
 """Time limit of one attempt to open a client session, seconds."""
-
-__all__ = [
-    "OPEN_S",
-    "Answer",
-    "Batch",
-    "Bus",
-    "BusSettings",
-    "Handle",
-    "IncomingQuery",
-    "Neighbour",
-    "PriorityClass",
-    "Publisher",
-    "ReadPayload",
-    "Sample",
-    "Sort",
-    "Tls",
-    "open_bus",
-    "open_router",
-    "read_key_expr",
-    "read_zenoh_log",
-]
 
 
 async def open_bus(
@@ -75,20 +52,12 @@ async def open_bus(
     timestamps: Zenoh stamps what is put here; kept frames need that. threads: each subscription has a thread, which
     relieves Zenoh's own at tens of thousands of samples a second; False saves each sample a change of threads.
     """
-    from zbridge.bus.zenoh import open_zenoh
+    from zbridge.bus.zenoh import open_zenoh, zenoh_config
 
-    return await open_zenoh(
-        settings,
-        metrics,
-        wait_for_peers=wait_for_peers,
-        bounds=bounds,
-        within_s=within_s,
-        realm=realm,
-        robot=robot,
-        timestamps=timestamps,
-        explain=explain,
-        threads=threads,
+    config = zenoh_config(
+        settings, wait_for_peers=wait_for_peers, bounds=bounds, within_s=within_s, timestamps=timestamps
     )
+    return await open_zenoh(config, settings, metrics, realm=realm, robot=robot, explain=explain, threads=threads)
 
 
 async def open_router(

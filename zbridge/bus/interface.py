@@ -15,7 +15,6 @@ from zbridge.metrics import Metrics
 Connection = Annotated[str, msgspec.Meta(pattern=r"^(tcp|udp|tls|quic|ws|unixsock-stream|serial|vsock)/[^ ]+$")]
 """Where Zenoh listens or connects: ``tcp/127.0.0.1:7447``."""
 
-
 SECURE = ("tls", "quic")
 """The kinds of endpoints that use certificates."""
 _FULL = "transport/link/tx/queue/congestion_control"

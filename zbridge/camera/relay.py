@@ -25,7 +25,7 @@ from zbridge.protocol.address import Address
 from zbridge.protocol.networks import is_among
 from zbridge.protocol.session_table import Backoff
 from zbridge.tasks import Tasks, race
-from zbridge.transport.waiting import waiting_sockets
+from zbridge.transport.door import waiting_sockets
 
 
 class Shot(msgspec.Struct, frozen=True):

@@ -29,6 +29,7 @@ from zbridge.fleet.printable import as_json as to_json
 from zbridge.fleet.printable import shown
 from zbridge.fleet.topics import is_concrete, is_name, split_key
 from zbridge.metrics import Metrics
+from zbridge.tasks import occurs
 
 _SHOWN = 8
 """Bytes of a value that are printed."""
@@ -171,9 +172,7 @@ async def echo(
 
     async with joined(settings, realm) as bus:
         bus.subscribe(key, show, history=True)
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(seconds or None):
-                await done.wait()
+        await occurs(done, seconds or None)
     if seen and seen >= count:
         return True
     errors.print(shown(f"{seen or 'no'} messages on {key} within {seconds:g} s"))

@@ -26,7 +26,7 @@ from zbridge.fleet.topics import KeySpace, is_name
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.protocol.plugin import Protocol, find_protocol
-from zbridge.tasks import together
+from zbridge.tasks import occurs, together
 from zbridge.toml import prefixed
 from zbridge.views.recording.capture import BusCapture, RecordPlan, publish_mark
 from zbridge.views.recording.contents import Pictures, describe_configuration
@@ -118,18 +118,12 @@ async def run_record(settings: BusSettings, options: RecordOptions) -> bool:
         errors.print(shown(f"recording {', '.join(plan.key_exprs)} to {tape.files[0]}"))
         begun = time.monotonic()
         try:
-            await until_signal(_until(full, duration_s))
+            await until_signal(occurs(full, duration_s))
         finally:
             recording.close()
             await asyncio.to_thread(recorder.close)
             _report_end(recorder, tape, time.monotonic() - begun)
     return recorder.error is None
-
-
-async def _until(full: asyncio.Event, duration_s: float | None) -> None:
-    with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(duration_s):
-            await full.wait()
 
 
 def _report_end(recorder: Recorder, tape: Tape, seconds: float) -> None:

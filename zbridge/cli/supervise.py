@@ -21,7 +21,9 @@ def supervise(paths: tuple[Path, ...], *, watch: bool, verbose: bool) -> None:
     set_up_log(verbose=False)
     if missing := [path for path in paths if not path.exists()]:
         raise ConfigError(f"{missing[0]}: No such file or directory")
-    _run(SupervisorState(tuple(map(str, paths)), watch, verbose, _host(paths)))
+    folders = [path for path in paths if path.is_dir()]
+    host = load_host(folders[0]) if len(folders) == 1 else HostSettings()  # several files or folders: the defaults
+    _run(SupervisorState(tuple(map(str, paths)), watch, verbose, host))
 
 
 def resume(descriptor: int) -> None:
@@ -36,9 +38,3 @@ def _run(state: SupervisorState) -> None:
     supervisor = Supervisor(state, ForkClient(fork_server_command()))
     gc.freeze()
     asyncio.run(until_signal(supervisor.run()))
-
-
-def _host(paths: tuple[Path, ...]) -> HostSettings:
-    """Read ``host.toml`` of the directory; the defaults where files were named, or several directories."""
-    folders = [path for path in paths if path.is_dir()]
-    return load_host(folders[0]) if len(folders) == 1 else HostSettings()

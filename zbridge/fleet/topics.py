@@ -168,11 +168,15 @@ def is_concrete(key: str) -> bool:
     return "*" not in key
 
 
+_FAMILIES: dict[str, Family] = {}
+
+
 def _family(prefix: str, message: type[FleetMessage], delivery: Delivery, most_bytes: int | None = None) -> Family:
     @lru_cache(maxsize=1024)
     def topic(name: str) -> Topic:
         return Topic(f"{prefix}/{escape(name)}", message, delivery, most_bytes)
 
+    _FAMILIES[prefix] = topic
     return topic
 
 
@@ -212,27 +216,13 @@ RPC_ACQUIRE = _family("@rpc/control/acquire", Acquire, Delivery.QUERY, QUERY_BYT
 RPC_TAKEOVER = _family("@rpc/control/takeover", Acquire, Delivery.QUERY, QUERY_BYTES)
 RPC_RENEW = Topic("@rpc/control/renew", Authorization, Delivery.QUERY, SMALL_BYTES)
 RPC_RELEASE = Topic("@rpc/control/release", Authorization, Delivery.QUERY, SMALL_BYTES)
-RPC_RESTART = _family("@rpc/restart", Query, Delivery.QUERY, QUERY_BYTES)
 RPC_UNLATCH = _family("@rpc/control/unlatch", Unlatch, Delivery.QUERY, SMALL_BYTES)
 RPC_UNLATCH_FLEET = _family("@rpc/control/unlatch_fleet", Unlatch, Delivery.QUERY, SMALL_BYTES)
 RPC_LATCH = Topic("@rpc/latch", Query, Delivery.QUERY, SMALL_BYTES)
 RPC_REFUSED = _family("@rpc/control/refused", Refusals, Delivery.QUERY, SETTING_BYTES)
+RPC_RESTART = _family("@rpc/restart", Query, Delivery.QUERY, QUERY_BYTES)
 
 _TOPICS = {topic.path: topic for topic in list(globals().values()) if isinstance(topic, Topic)}
-_FAMILIES = {
-    "sensor": SENSOR,
-    "raw": RAW,
-    "@cmd/motor": CMD_MOTOR,
-    "@cmd/sensor": CMD_SENSOR,
-    "@cmd/raw": CMD_RAW,
-    "@rpc/sessions": RPC_SESSIONS,
-    "@rpc/control/acquire": RPC_ACQUIRE,
-    "@rpc/control/takeover": RPC_TAKEOVER,
-    "@rpc/control/unlatch": RPC_UNLATCH,
-    "@rpc/control/unlatch_fleet": RPC_UNLATCH_FLEET,
-    "@rpc/control/refused": RPC_REFUSED,
-    "@rpc/restart": RPC_RESTART,
-}
 
 
 def _bounded() -> Iterator[tuple[str, int]]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from zbridge.fleet import topics
 from zbridge.fleet.messages import (
     Control,
@@ -73,9 +71,8 @@ class RobotView:
             if self.protocol is not None and self.protocol != message.protocol:
                 self.forget()
             self.protocol, self.version, self.features = message.protocol, message.version, message.features
-        keep = _KEPT.get(topic.path)
-        if keep is not None:
-            keep(self, message)
+        if topic.path in _KEPT:
+            setattr(self, topic.path, message)
 
     def forget(self) -> None:
         """Forget what was seen: another robot has taken the name."""
@@ -84,14 +81,5 @@ class RobotView:
         self.control, self.alive = control, alive
 
 
-def _keeper(name: str) -> Callable[[RobotView, FleetMessage], None]:
-    return lambda view, message: setattr(view, name, message)
-
-
-_KEPT = {
-    topic.path: _keeper(topic.path)
-    for topic in (
-        *(topics.STATUS, topics.CONTROL, topics.POSE, topics.MAP, topics.SCAN, topics.MOTION),
-        *(topics.SCANNER, topics.LIDAR, topics.CAMERA, topics.DEVICES),
-    )
-}
+_KEPT = frozenset({"status", "control", "pose", "map", "scan", "motion", "scanner", "lidar", "camera", "devices"})
+"""Paths that are attributes too."""

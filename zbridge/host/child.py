@@ -111,7 +111,9 @@ class Reporter(Observer):
         """Start the heartbeats, and receive from the supervisor."""
         self._loop = asyncio.get_running_loop()
         self._loop.add_reader(self._channel.fileno(), self._receive)
-        self._share()
+        self._memory = MemoryWriter()
+        self._channel.send(Shared(), [self._memory.descriptor])
+        self._memory.close_descriptor()
         self._send_heartbeat()
 
     def close(self) -> None:
@@ -273,11 +275,6 @@ class Reporter(Observer):
         taken = {slot_of(number) for number, _, _ in self._links.values()}
         after = (self._numbers % _NUMBERS + step for step in range(1, SLOTS + 1))
         return next(number for number in after if slot_of(number) not in taken)
-
-    def _share(self) -> None:
-        self._memory = MemoryWriter()
-        self._channel.send(Shared(), [self._memory.descriptor])
-        self._memory.close_descriptor()
 
     def _report_sockets(self, link: Link) -> None:
         """Send the sockets of a link that were not sent yet: that of datagrams is opened later."""

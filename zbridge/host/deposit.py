@@ -54,34 +54,25 @@ class Deposit:
         name = self.duplicates.name_of(link)
         self.duplicates.closed(link)
         if self.predecessor is not None and name is not None and self.duplicates.link_of(name) is None:
-            self.predecessor.close_named(name)
-
-    def close_named(self, name: str) -> None:
-        """Do the same for all links of this name."""
-        while (link := self.duplicates.link_of(name)) is not None:
-            self.duplicates.closed(link)
-        if self.predecessor is not None:
-            self.predecessor.close_named(name)
+            for each in self.predecessor._chain:
+                while (older := each.duplicates.link_of(name)) is not None:
+                    each.duplicates.closed(older)
 
     async def stop(self, times: int) -> bool | None:
         """Write the robot's stop so often; whether its link accepted it, None if there is no link or no stop."""
-        last = self.last_stop
-        at = self
-        while not len(at.duplicates) and at.predecessor is not None:
-            at = at.predecessor
-        return await at.duplicates.stop(last, times)
+        linked = next((each for each in self._chain if len(each.duplicates)), self)
+        return await linked.duplicates.stop(self.last_stop, times)
 
     @property
     def last_stop(self) -> LastStop:
         """The newest stop that has frames, while the process has made no deposit of its own."""
-        if self.last.frames or self.predecessor is None:
-            return self.last
-        return self.predecessor.last_stop
+        chain = self._chain
+        return next((each.last for each in chain if each.last.frames), chain[-1].last)
 
     @property
     def has_links(self) -> bool:
         """Whether a connection is held open here."""
-        return bool(len(self.duplicates)) or (self.predecessor is not None and self.predecessor.has_links)
+        return any(len(each.duplicates) for each in self._chain)
 
     def inheritance(self) -> tuple[HandoverState, Parcel]:
         """Return what a successor of the dead process can take over; raise HandoverError with the reason for nothing.
@@ -112,9 +103,8 @@ class Deposit:
 
     async def drain(self) -> None:
         """Close everything, but first let the robot read its stop."""
-        await self.duplicates.drain()
-        if self.predecessor is not None:
-            await self.predecessor.drain()
+        for each in self._chain:
+            await each.duplicates.drain()
 
     def close(self) -> None:
         """Close everything; idempotent."""
@@ -131,29 +121,35 @@ class Deposit:
 
     # Link by link
 
+    @property
+    def _chain(self) -> tuple[Deposit, ...]:
+        """This deposit, and those before it that still count, the newest first."""
+        return (self, *(self.predecessor._chain if self.predecessor is not None else ()))
+
     def _state(self) -> tuple[bytes, tuple[tuple[str, int], ...]]:
         """Return the newest state, and its sockets by the names of their links."""
-        if self.deposited is None:
-            return self.predecessor._state() if self.predecessor is not None else (b"", ())
-        names = [(self.duplicates.name_of(link), at) for link, at in self.deposited.sockets]
-        if self.memory is None or not names or any(name is None for name, _ in names):
+        newest = next((each for each in self._chain if each.deposited is not None), None)
+        if newest is None or newest.memory is None or (deposited := newest.deposited) is None:
             return b"", ()
-        data = self.memory.deposit(self.deposited.area, self.deposited.size)
+        names = [(newest.duplicates.name_of(link), at) for link, at in deposited.sockets]
+        if not names or any(name is None for name, _ in names):
+            return b"", ()
+        data = newest.memory.deposit(deposited.area, deposited.size)
         return data, tuple((name, at) for name, at in names if name is not None)
 
     def _partial(self, name: str) -> Partial | None:
         """Return where the stream of a link was cut; None if nobody can resume it."""
-        link = self.duplicates.link_of(name)
-        if link is not None:
-            if self.memory is None:
-                return None
-            if self.memory.is_touched(link) or self.predecessor is None:
-                return self.memory.partial(link)
-        return self.predecessor._partial(name) if self.predecessor is not None else None
+        for each in self._chain:
+            if (link := each.duplicates.link_of(name)) is not None:
+                if each.memory is None:
+                    return None
+                if each.memory.is_touched(link) or each.predecessor is None:
+                    return each.memory.partial(link)
+        return None
 
     def _descriptor(self, name: str, at: int) -> int | None:
         """Return a descriptor of a link; None if there is none, or half a frame was written."""
-        link = self.duplicates.link_of(name)
-        if link is not None:
-            return self.duplicates.descriptor(link, at)
-        return self.predecessor._descriptor(name, at) if self.predecessor is not None else None
+        for each in self._chain:
+            if (link := each.duplicates.link_of(name)) is not None:
+                return each.duplicates.descriptor(link, at)
+        return None

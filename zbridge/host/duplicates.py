@@ -33,38 +33,29 @@ _READS, _READ_BYTES = 32, 65_536
 
 
 class Duplicate(msgspec.Struct):
-    """The sockets of one link: descriptors of its stream, and of its datagrams where there are any."""
+    """The sockets of one link. descriptors: of its stream, then of its datagrams where there are any."""
 
     link: int
     name: str
     drives: bool
     boundary: Boundary = Boundary()
-    stream: int | None = None
-    datagrams: int | None = None
+    descriptors: tuple[int, ...] = ()
 
     def set_descriptors(self, descriptors: Sequence[int]) -> None:
         """Set the descriptors: the stream's first, then the one of datagrams; those before are closed."""
         self.close()
-        self.stream, self.datagrams = (*descriptors, None, None)[:2]
+        self.descriptors = tuple(descriptors[:2])
         close_all(descriptors[2:])
-
-    def descriptor(self, at: int) -> int | None:
-        """Return the stream's descriptor (0), or that of datagrams (1)."""
-        return (self.stream, self.datagrams)[at] if at in (0, 1) else None
 
     def close(self) -> None:
         """Close the duplicates; idempotent."""
         close_all(self.descriptors)
-        self.stream = self.datagrams = None
-
-    @property
-    def descriptors(self) -> tuple[int, ...]:
-        return tuple(number for number in (self.stream, self.datagrams) if number is not None)
+        self.descriptors = ()
 
     def discard_input(self) -> None:
         """Read what waits, and discard it."""
-        if self.stream is not None and stat.S_ISSOCK(os.fstat(self.stream).st_mode):
-            with _borrowed(self.stream) as stream, contextlib.suppress(OSError):
+        if self.descriptors and stat.S_ISSOCK(os.fstat(self.descriptors[0]).st_mode):
+            with _borrowed(self.descriptors[0]) as stream, contextlib.suppress(OSError):
                 for _ in range(_READS):
                     stream.recv(_READ_BYTES, socket.MSG_DONTWAIT)
 
@@ -83,23 +74,17 @@ class Duplicate(msgspec.Struct):
         return True
 
     def _write(self, data: bytes, *, datagram: bool) -> bool:
-        stream = self.stream
-        if stream is None or not self.boundary.outgoing:
+        if len(self.descriptors) < (2 if datagram else 1) or not self.boundary.outgoing:
             return False
         try:
-            if datagram:
-                return self._send_datagram(stream, data)
-            return os.write(stream, data) == len(data)
+            if not datagram:
+                return os.write(self.descriptors[0], data) == len(data)
+            with _borrowed(self.descriptors[0]) as robot, _borrowed(self.descriptors[1]) as own:
+                # To where the stream leads: a robot takes datagrams at the same address and port.
+                return own.sendto(data, socket.MSG_DONTWAIT, robot.getpeername()) == len(data)
         except OSError as error:
             log.debug("%s: no stop written: %s", self.name, error)
             return False
-
-    def _send_datagram(self, stream: int, data: bytes) -> bool:
-        """Send to where the stream leads: a robot takes datagrams at the same address and port."""
-        if self.datagrams is None:
-            return False
-        with _borrowed(stream) as robot, _borrowed(self.datagrams) as own:
-            return own.sendto(data, socket.MSG_DONTWAIT, robot.getpeername()) == len(data)
 
 
 @contextlib.contextmanager
@@ -148,7 +133,8 @@ class Duplicates:
         None if there is none, or half a frame was written.
         """
         duplicate = self._links.get(link)
-        return duplicate.descriptor(at) if duplicate is not None and duplicate.boundary.outgoing else None
+        usable = duplicate.descriptors if duplicate is not None and duplicate.boundary.outgoing else ()
+        return usable[at] if 0 <= at < len(usable) else None
 
     def set_boundaries(self, streams: dict[int, Boundary]) -> None:
         """Note where the streams are between frames."""

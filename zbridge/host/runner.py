@@ -28,7 +28,6 @@ A process runs by the content of its file that was checked, never by what the fi
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import signal
 import socket
@@ -46,7 +45,7 @@ from zbridge.host.process import KILLED_S, GatewayProcess
 from zbridge.host.replacement import RunnerState
 from zbridge.host.succession import GONE_S, Launcher, Succession
 from zbridge.host.watchdog import HEALTHY_S, RestartDelay
-from zbridge.tasks import Tasks
+from zbridge.tasks import Tasks, occurs
 from zbridge.toml import FILE_BYTES
 
 log = logging.getLogger("zbridge.host")
@@ -294,9 +293,7 @@ class Runner:
 
     async def _wait_until(self, at: float) -> None:
         self._next_at = at
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(at - time.monotonic()):
-                await self._now.wait()
+        await occurs(self._now, at - time.monotonic())
         self._next_at = None
         self._now.clear()
 
@@ -308,10 +305,7 @@ class Runner:
         self._settled.clear()
         process.signal(signal.SIGUSR2)
         for event, within_s in ((self._asked, ASK_S), (self._settled, HAND_OVER_S)):
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(within_s):
-                    await event.wait()
-            if not event.is_set():
+            if not await occurs(event, within_s):
                 break
         if process.succeeded:
             await process.gone(END_S)

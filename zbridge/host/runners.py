@@ -168,18 +168,6 @@ class Reports:
             delay_s = STATUS_S if self.is_ready else READY_S
             self._timer = asyncio.get_running_loop().call_later(delay_s, self._report)
 
-    def reloading(self, now_us: int) -> None:
-        """Report that files are read again; :meth:`reloaded` must follow. now_us: monotonic microseconds."""
-        self._systemd.notify("RELOADING=1", f"MONOTONIC_USEC={now_us}")
-
-    def reloaded(self) -> None:
-        """Report that files have been read again."""
-        self._systemd.notify("READY=1")
-
-    def ending(self) -> None:
-        """Report that the service ends."""
-        self._systemd.notify("STOPPING=1", f"STATUS=ending {len(self._runners.by_path)} gateways")
-
     async def live(self) -> None:
         """Notify systemd's watchdog, where it wants that."""
         while self._systemd.watchdog_s:

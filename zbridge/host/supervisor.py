@@ -10,7 +10,6 @@ supervisor gives its place to the installed code (:mod:`zbridge.host.replacement
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import ctypes
 import logging
 import signal
@@ -26,7 +25,7 @@ from zbridge.host.fork_client import ForkClient, module_command
 from zbridge.host.replacement import SIGNALS, SupervisorState, quiet_threads, replace
 from zbridge.host.runner import Runner
 from zbridge.host.runners import Reports, Runners
-from zbridge.tasks import Tasks
+from zbridge.tasks import Tasks, occurs
 
 log = logging.getLogger("zbridge.host")
 
@@ -52,9 +51,10 @@ class Supervisor:
         """The installation whose code has not taken over."""
         self._forced = False
         """Set to replace this code though the installation is the same."""
-        self.runners = Runners(self._runner, self._state_changed, stagger_s=state.host.stagger_s)
+        self.runners = Runners(self._runner, self._changed, stagger_s=state.host.stagger_s)
         self.runners.faults.update((Path(path), fault) for path, fault in state.faults.items())
-        self._reports = Reports(Systemd(), self.runners, is_ready=state.is_ready)
+        self._systemd = Systemd()
+        self._reports = Reports(self._systemd, self.runners, is_ready=state.is_ready)
         self._sources = tuple(map(Path, state.sources))
         self._follower = Follower(self._sources, self.runners.faults, state.host.file_bytes)
         self._running = Tasks()
@@ -103,7 +103,7 @@ class Supervisor:
                 await asyncio.sleep(FORKED_S)
 
     async def _end(self) -> None:
-        self._reports.ending()
+        self._systemd.notify("STOPPING=1", f"STATUS=ending {len(self.runners.by_path)} gateways")
         await self.runners.end()
         await self._running.end()
         if self._timer is not None:
@@ -120,13 +120,10 @@ class Supervisor:
     async def follow(self) -> None:
         """Follow the files and the installation: at :meth:`reload`, and with ``watch`` every WATCH_S."""
         while True:
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(WATCH_S if self._state.watch or self._forks.unsettled else None):
-                    await self._reload.wait()
-            asked = self._reload.is_set()
+            asked = await occurs(self._reload, WATCH_S if self._state.watch or self._forks.unsettled else None)
             self._reload.clear()
             if asked:
-                self._reports.reloading(time.monotonic_ns() // 1000)
+                self._systemd.notify("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
             try:
                 if asked or self._state.watch:
                     running = {path: runner.file for path, runner in self.runners.by_path.items()}
@@ -135,7 +132,7 @@ class Supervisor:
             except (ConfigError, NotReady) as error:
                 log.error("%s", error)
             if asked:
-                self._reports.reloaded()
+                self._systemd.notify("READY=1")
             await self.follow_code(asked=asked)
 
     # Its own code
@@ -190,12 +187,10 @@ class Supervisor:
     # Processes
 
     def _runner(self, file: RobotFile) -> Runner:
-        state = self._state
-        return Runner(
-            file, self._forks, verbose=state.verbose, changed=self._state_changed, most_bytes=state.host.file_bytes
-        )
+        verbose, most_bytes = self._state.verbose, self._state.host.file_bytes
+        return Runner(file, self._forks, verbose=verbose, changed=self._changed, most_bytes=most_bytes)
 
-    def _state_changed(self) -> None:
+    def _changed(self) -> None:
         self._reports.changed()
 
     def _check_watchdogs(self) -> None:

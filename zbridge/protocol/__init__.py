@@ -7,23 +7,23 @@ event loop, socket, clock, bus, and no robot in particular.
 plugin          :class:`Protocol`: what an entry point names. :class:`RobotSide` and :class:`HqSide`: its sides, with
                 :class:`Outcome`, :data:`Telemetry`, :data:`Translate` and :data:`Send`; :class:`RobotUser`: what a
                 side may do for a client every ``ATTEND_S`` seconds.
-                :class:`Simulation`, :class:`HqSimulation`: how its simulators are started.
+                :class:`Simulation`, :class:`HqSimulation`: how its simulators are started. :class:`Codec`: the
+                messages, for the conformance kit.
 session         :class:`Session`: one conversation, in a :class:`Role`, within :class:`Limits`, in a :class:`State`,
                 with its :class:`Traffic`; a :class:`Datagram` is a frame that goes by UDP, and a session with
                 :class:`SourceClaims` says which of them are its peer's.
 session_table   :class:`ClientIds`: the ids that a robot gives its clients.
 outbox          :class:`Outbox`: what a session still has to write; ``LIMIT`` frames may wait.
-negotiation     :func:`agree`, :func:`newest`, :func:`parse_versions`: which version both sides speak.
 handshake       :class:`Handshake`: executes the table of a handshake, with the time limit of each step.
+                :func:`agree`, :func:`newest`, :func:`parse_versions`: which version both sides speak.
 device_clock    :class:`DeviceClock`: when a device measured, by its own millisecond counter.
 rate_limit      :class:`RateLimit`: how often something may happen.
 exchange        :class:`ExchangeSession`, :class:`Exchange`: a session that asks, awaits the answer and polls.
-codec           :class:`Codec`: the messages, for the conformance kit.
 kinematics      :class:`Differential`, :class:`Factors`: from drives to wheels, and back; :data:`Positive` for options.
+                :class:`Odometry`: from what the wheels have turned to a pose.
 kept            :class:`Kept`: what survives a restart of the gateway, as :class:`Exported`; :class:`Form`, ``FRAME``,
                 ``FRAMES`` for what no type describes; :class:`Spare`: what may be left out where it is large;
                 :class:`Frame`: a frame of a kind of its own.
-odometry        :class:`Odometry`: from what the wheels have turned to a pose.
 bearings        :class:`BearingScan`, :class:`Sectors`: from distance sensors to scans, and back.
 errors          :class:`ProtocolError` for bytes that are no message, :class:`EncodeError` for values that no message
                 can carry, :class:`ConfigError` for options; :class:`Refused` for commands: :class:`Unsupported`,
@@ -49,17 +49,15 @@ from zbridge.errors import (
 from zbridge.metrics import Count, Metrics
 from zbridge.protocol.address import Address
 from zbridge.protocol.bearings import BearingScan, Sectors
-from zbridge.protocol.codec import Codec
 from zbridge.protocol.device_clock import DeviceClock
 from zbridge.protocol.exchange import Exchange, ExchangeSession
-from zbridge.protocol.handshake import Handshake
+from zbridge.protocol.handshake import Handshake, agree, newest, parse_versions
 from zbridge.protocol.kept import FRAME, FRAMES, Exported, Form, Frame, Kept, Spare
-from zbridge.protocol.kinematics import Differential, Factors, Positive
-from zbridge.protocol.negotiation import agree, newest, parse_versions
-from zbridge.protocol.odometry import Odometry
+from zbridge.protocol.kinematics import Differential, Factors, Odometry, Positive
 from zbridge.protocol.outbox import LIMIT, Outbox
 from zbridge.protocol.plugin import (
     ATTEND_S,
+    Codec,
     HqSide,
     HqSimulation,
     Outcome,

@@ -179,7 +179,7 @@ class ExchangeSession(Session[M]):
         awaited = self.exchange.awaited
         if awaited is not None and self.answers(awaited, message):
             self.exchange.answered()
-            self._heard()
+            self.busy = None if self.busy == SILENT else self.busy
         elif not self.unasked(message):
             raise ProtocolError(f"{frame[:_QUOTED]!r} answers no request" + (f", not {awaited!r}" if awaited else ""))
         return message
@@ -207,10 +207,6 @@ class ExchangeSession(Session[M]):
         """End the conversation once the requests that wait are written; their answers are not awaited."""
         self.exchange.open()
         super().close(reason, now)
-
-    def _heard(self) -> None:
-        if self.busy == SILENT:
-            self.busy = None
 
 
 _QUOTED = 40

@@ -1,4 +1,4 @@
-"""Executes the table of a handshake: ``{step: {event: (action, next step)}}``. Sans-IO.
+"""Executes the table of a handshake: ``{step: {event: (action, next step)}}``; chooses the version. Sans-IO.
 
 A session contributes the table, the time that each step may last, and the actions, which are its own methods. It fires
 an event for each message of the handshake and calls :meth:`Handshake.expire` at :attr:`Handshake.deadline`.
@@ -7,7 +7,8 @@ an event for each message of the handshake and calls :meth:`Handshake.expire` at
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable, Mapping
+import re
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping
 from typing import Any, ClassVar, Generic, TypeVar
 
 from zbridge.errors import ProtocolError
@@ -72,3 +73,29 @@ class Handshake(Kept, Generic[Step, Event]):
         if now >= self.deadline:
             self.deadline = math.inf
             self.fire(self._timeout, now)
+
+
+_VERSION = re.compile(r"\d{1,9}(\.\d{1,9})*")
+
+
+def parse_versions(listed: str) -> tuple[str, ...]:
+    """Read a comma-separated version list; ignore entries that are not dotted numbers."""
+    entries = (entry.strip() for entry in listed.split(","))
+    return tuple(entry for entry in entries if _VERSION.fullmatch(entry))
+
+
+def agree(ours: Iterable[str], theirs: Iterable[str]) -> str | None:
+    """Choose the highest common version, compared number by number; None: there is none."""
+    common = set(ours) & set(theirs)
+    return max(common, key=_numbers, default=None)
+
+
+def newest(listed: Iterable[str], known: Collection[str]) -> str | None:
+    """Choose the newest known version that is not newer than the newest listed; None: there is none."""
+    limit = max(map(_numbers, listed), default=None)
+    fitting = [version for version in known if limit is not None and _numbers(version) <= limit]
+    return max(fitting, key=_numbers, default=None)
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    return tuple(int(part) for part in version.split("."))

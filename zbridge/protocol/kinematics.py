@@ -1,4 +1,4 @@
-"""Kinematics: what a drive means for the wheels of a robot, and back. Sans-IO.
+"""Kinematics: what a drive means for the wheels of a robot, and back; the pose that follows. Sans-IO.
 
 A drive holds fractions of full scale (-1..1, after REP 103: forward, left and counter-clockwise positive); a robot
 takes speeds. The classes are tables of a configuration too: a protocol's options may contain them or extend them.
@@ -6,12 +6,13 @@ takes speeds. The classes are tables of a configuration too: a protocol's option
 
 from __future__ import annotations
 
+import math
 from typing import Annotated
 
 import msgspec
 
 from zbridge.errors import Unsupported
-from zbridge.fleet.messages import Drive
+from zbridge.fleet.messages import Drive, Pose
 
 Positive = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
 Factor = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
@@ -62,3 +63,34 @@ class Factors(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def value(self, drive: Drive) -> float:
         """Return the value of the motor for a drive, in the motor's unit."""
         return drive.forward * self.forward + drive.left * self.left + drive.turn * self.turn
+
+
+class Odometry:
+    """A pose that begins at the origin, heading along x. ``track_m``: between the two sides of wheels."""
+
+    def __init__(self, track_m: float) -> None:
+        self._track_m = track_m
+        self._sides_m: tuple[float, float] | None = None
+        self._x = self._y = self._heading = 0.0
+
+    def __repr__(self) -> str:
+        return f"<Odometry x={self._x:.3f} y={self._y:.3f} heading={self._heading:.3f}>"
+
+    def restart(self) -> None:
+        """Treat the next positions as those of the current pose: the robot's counters may have been reset."""
+        self._sides_m = None
+
+    def sides(self, left_m: float, right_m: float, stamp_ns: int) -> Pose:
+        """Return the pose for the distances that the two sides have covered since their counters began, metres."""
+        left_before, right_before = self._sides_m or (left_m, right_m)
+        self._sides_m = (left_m, right_m)
+        left, right = left_m - left_before, right_m - right_before
+        return self.moved((left + right) / 2, (right - left) / self._track_m, stamp_ns)
+
+    def moved(self, way_m: float, turned_rad: float, stamp_ns: int) -> Pose:
+        """Return the pose after a path of ``way_m`` on which the robot turned by ``turned_rad``, counter-clockwise."""
+        along = self._heading + turned_rad / 2
+        self._x += way_m * math.cos(along)
+        self._y += way_m * math.sin(along)
+        self._heading = math.remainder(self._heading + turned_rad, 2 * math.pi)
+        return Pose(self._x, self._y, self._heading, stamp_ns=stamp_ns)

@@ -1,8 +1,10 @@
 """What a session still has to write: one frame at a time, with a gap between two writes. Sans-IO.
 
-Theory of operation ------------------- A session puts frames in. The driver gets one with ``take(now)``, writes it,
-reports the write with ``written(now)`` and returns at ``deadline()``. Fragile peers treat one read as one packet, so
-``take`` returns None for ``gap_s`` after a write.
+Theory of operation
+-------------------
+A session puts frames in. The driver gets one with ``take(now)``, writes it, reports the write with ``written(now)`` and
+returns at ``deadline()``. Fragile peers treat one read as one packet, so ``take`` returns None for ``gap_s`` after a
+write.
 
 Four places for frames. ``take`` serves them in this order:
 
@@ -237,8 +239,6 @@ class Outbox(Kept):
 
     def _hurries(self, group: tuple[bytes, ...]) -> bool:
         """Return whether a group still waits among the urgent frames, whole and in its order."""
-        if len(group) == 1:
-            return group[0] in self._urgent
         urgent = tuple(self._urgent)
         return any(urgent[start : start + len(group)] == group for start in range(len(urgent) - len(group) + 1))
 

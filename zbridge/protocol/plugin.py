@@ -21,11 +21,11 @@ from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address, DeviceAddress, ZenohAddress, parse_device_address
-from zbridge.protocol.codec import Codec
 from zbridge.protocol.entry_points import entry_points, find_entry_point
 from zbridge.protocol.kept import Kept
 from zbridge.protocol.session import Limits, Session, State
 from zbridge.protocol.session_table import ClientIds
+from zbridge.wire.frames import FrameEnd
 
 GROUP = "zbridge.protocols"
 
@@ -254,6 +254,20 @@ class Simulation(msgspec.Struct, frozen=True):
     udp: bool = False
     fragile: bool = False
     ready: Callable[[tuple[Address, ...]], None] = lambda addresses: None
+
+
+class Codec(msgspec.Struct, frozen=True):
+    """The messages that one side sends in one dialect, and how they are written, read and framed; for the kit.
+
+    write: returns one frame, raises EncodeError. read: decodes one frame, raises ProtocolError and nothing else.
+    messages: examples. A class stands for one example whose fields the kit fills in.
+    """
+
+    name: str
+    write: Callable[[Any], bytes]
+    read: Callable[[bytes], Any]
+    frame_end: FrameEnd
+    messages: tuple[Any, ...]
 
 
 class _NoOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

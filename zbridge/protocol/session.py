@@ -4,7 +4,7 @@ Theory of operation
 -------------------
 The state of a session is an entry of the table in :mod:`zbridge.protocol.session_states`; ``_on`` executes it. A driver
 (a conversation over a link, a simulator, a test) calls ``open`` when the transport is up, ``receive`` with the bytes
-that were read and ``lost`` when the transport is gone. After each call it writes ``outgoing(now)`` until that is None,
+that were read and ``fail`` when the transport is gone. After each call it writes ``outgoing(now)`` until that is None,
 and calls ``expire(now)`` at ``deadline()``.
 
 A protocol contributes the framing function, ``decode``, ``encode`` and the steps of its handshake: ``opened`` takes the
@@ -28,7 +28,7 @@ from zbridge.fleet.messages import SessionEntry
 from zbridge.protocol.kept import Budget, Exported, Kept
 from zbridge.protocol.outbox import Outbox
 from zbridge.protocol.rate_limit import RateLimit
-from zbridge.protocol.session_states import TRANSITIONS, SessionAction, SessionEvent
+from zbridge.protocol.session_states import TRANSITIONS, SessionEvent
 from zbridge.protocol.session_states import State as State
 from zbridge.protocol.traffic import Datagram as Datagram
 from zbridge.protocol.traffic import Limits as Limits
@@ -262,12 +262,8 @@ class Session(Kept, ABC, Generic[M]):
         """End the conversation from our side once the waiting frames are written."""
         self._on(SessionEvent.CLOSE, reason, now)
 
-    def lost(self, reason: str) -> None:
-        """End the conversation: the transport is gone. The first reason is kept."""
-        self.fail(reason)
-
     def fail(self, reason: str) -> None:
-        """End the conversation at once."""
+        """End the conversation at once: the transport is gone, or of no use. The first reason is kept."""
         self._on(SessionEvent.LOST, reason)
 
     # What a protocol's own code calls
@@ -289,7 +285,7 @@ class Session(Kept, ABC, Generic[M]):
             self._on(SessionEvent.AGREED)
 
     def lift_limit(self) -> None:
-        """Lift the time limit of the handshake: the protocol's own timers watch it from here."""
+        """Lift the time limit of the handshake: it is complete, or the protocol's own timers watch it from here."""
         self._limit_at = math.inf
 
     def send(self, message: M) -> None:
@@ -347,19 +343,15 @@ class Session(Kept, ABC, Generic[M]):
     # The table, executed
 
     def _on(self, event: SessionEvent, reason: str = "", now: float = math.inf) -> None:
-        step = TRANSITIONS[self.state].get(event)
-        if step is not None:
-            action, self.state = step
-            _ACTIONS[action](self, reason, now)
+        state = TRANSITIONS[self.state].get(event)
+        if state is not None:
+            self.state = state
+            _ACTIONS[event](self, reason, now)
 
 
 def _begin(session: Session[Any], reason: str, now: float) -> None:
     session._limit_at = now + session.limits.handshake_s
     session.opened(now)
-
-
-def _settle(session: Session[Any], reason: str, now: float) -> None:
-    session._limit_at = math.inf
 
 
 def _leave(session: Session[Any], reason: str, now: float) -> None:
@@ -371,9 +363,11 @@ def _end(session: Session[Any], reason: str, now: float) -> None:
     session.reason, session.busy, session.doubts = session.reason or reason, None, ()
 
 
-_ACTIONS: dict[SessionAction, Callable[[Session[Any], str, float], None]] = {
-    SessionAction.BEGIN: _begin,
-    SessionAction.SETTLE: _settle,
-    SessionAction.LEAVE: _leave,
-    SessionAction.END: _end,
+_ACTIONS: dict[SessionEvent, Callable[[Session[Any], str, float], None]] = {
+    SessionEvent.OPEN: _begin,
+    SessionEvent.AGREED: lambda session, reason, now: session.lift_limit(),
+    SessionEvent.CLOSE: _leave,
+    SessionEvent.WRITTEN: _end,
+    SessionEvent.OVERDUE: _end,
+    SessionEvent.LOST: _end,
 }

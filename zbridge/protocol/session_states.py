@@ -15,7 +15,8 @@ Who reports an event: the driver OPEN (the transport is up) and LOST (it is gone
 complete), CLOSE (say goodbye) and LOST (the peer broke the protocol); the session itself WRITTEN (nothing waits to be
 written) and OVERDUE (the time limit has passed).
 
-The state changes before the action runs: the first step of a handshake may complete it.
+What a session does depends on the event alone (:mod:`zbridge.protocol.session`). The state changes before: the first
+step of a handshake may complete it.
 """
 
 from __future__ import annotations
@@ -44,40 +45,27 @@ class SessionEvent(Enum):
     LOST = "lost"
 
 
-class SessionAction(Enum):
-    """What a session does on an event."""
-
-    BEGIN = "begin"
-    """Start the time limit; take the first step of the handshake."""
-    SETTLE = "settle"
-    """Lift the time limit."""
-    LEAVE = "leave"
-    """Record the reason; start the time limit for the last frames."""
-    END = "end"
-    """Record the first reason."""
-
-
-TRANSITIONS: dict[State, dict[SessionEvent, tuple[SessionAction, State]]] = {
+TRANSITIONS: dict[State, dict[SessionEvent, State]] = {
     State.CONNECTING: {
-        SessionEvent.OPEN: (SessionAction.BEGIN, State.HANDSHAKING),
-        SessionEvent.CLOSE: (SessionAction.LEAVE, State.CLOSING),
-        SessionEvent.LOST: (SessionAction.END, State.CLOSED),
+        SessionEvent.OPEN: State.HANDSHAKING,
+        SessionEvent.CLOSE: State.CLOSING,
+        SessionEvent.LOST: State.CLOSED,
     },
     State.HANDSHAKING: {
-        SessionEvent.AGREED: (SessionAction.SETTLE, State.ESTABLISHED),
-        SessionEvent.CLOSE: (SessionAction.LEAVE, State.CLOSING),
-        SessionEvent.OVERDUE: (SessionAction.END, State.CLOSED),
-        SessionEvent.LOST: (SessionAction.END, State.CLOSED),
+        SessionEvent.AGREED: State.ESTABLISHED,
+        SessionEvent.CLOSE: State.CLOSING,
+        SessionEvent.OVERDUE: State.CLOSED,
+        SessionEvent.LOST: State.CLOSED,
     },
     State.ESTABLISHED: {
-        SessionEvent.AGREED: (SessionAction.SETTLE, State.ESTABLISHED),
-        SessionEvent.CLOSE: (SessionAction.LEAVE, State.CLOSING),
-        SessionEvent.LOST: (SessionAction.END, State.CLOSED),
+        SessionEvent.AGREED: State.ESTABLISHED,
+        SessionEvent.CLOSE: State.CLOSING,
+        SessionEvent.LOST: State.CLOSED,
     },
     State.CLOSING: {
-        SessionEvent.WRITTEN: (SessionAction.END, State.CLOSED),
-        SessionEvent.OVERDUE: (SessionAction.END, State.CLOSED),
-        SessionEvent.LOST: (SessionAction.END, State.CLOSED),
+        SessionEvent.WRITTEN: State.CLOSED,
+        SessionEvent.OVERDUE: State.CLOSED,
+        SessionEvent.LOST: State.CLOSED,
     },
     State.CLOSED: {},
 }

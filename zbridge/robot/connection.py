@@ -258,7 +258,7 @@ class Connection:
                 self._link = await settings.connect(self.address, conversation)
             await conversation.ended
         except LinkError as error:
-            session.lost(str(error))
+            session.fail(str(error))
         finally:
             conversation.abandon()
             self.conversation = None

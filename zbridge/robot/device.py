@@ -38,8 +38,6 @@ from zbridge.robot.telemetry import Telemetry
 from zbridge.transport import ConversationHooks, Parcel, Transferable
 from zbridge.wire.frames import Partial
 
-STOPS_BEFORE = 2
-"""Idle stops that a robot is sent before a restart, where it was driven and its protocol asks for them."""
 HEARD_S = 3.0
 """A robot of which nothing came for so long is not healthy."""
 ASIDE_S = 1.0
@@ -284,8 +282,7 @@ class RobotDevice(Transferable):
     async def prepare(self, reason: str, within_s: float) -> None:
         """Stop the robot, end the lease and take no commands; wait until the links can be handed over.
 
-        A robot that was driven, and misses some stops, is sent more of them first: nothing is written later, for as
-        long as a successor takes that is slow, or hangs.
+        A driven robot that misses some stops is sent two more of them first: a successor that hangs writes nothing.
         Raises Refused with the reason where that takes longer than ``within_s``; :meth:`resume` takes it all back.
         """
         if not self._context.robot.hands_over:
@@ -296,7 +293,7 @@ class RobotDevice(Transferable):
         self._context.pump()
         until = self._context.clock() + within_s
         if driven and math.isfinite(often_s := self._context.robot.idle_stop_s):
-            await asyncio.sleep(STOPS_BEFORE * often_s)
+            await asyncio.sleep(2 * often_s)
         while any(connection.blocker for connection in self._links):
             if self._context.clock() >= until:
                 raise NotReady("; ".join(f"{each.name}: {each.blocker}" for each in self._links if each.blocker))

@@ -13,7 +13,7 @@ import re
 import time
 from collections.abc import Callable
 
-from zbridge.bus import Bus, IncomingQuery, Neighbour, open_router
+from zbridge.bus import IncomingQuery, Neighbour, open_router
 from zbridge.errors import BusError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -46,7 +46,8 @@ class Router:
         with prefixed(f"no router at {', '.join(settings.listen)}: ", BusError):
             bus = await open_router(zenoh_values(self._plan), Metrics(), self.note)
         try:
-            self._serve(bus)
+            if settings.tls is not None:
+                bus.answer(topics.whoami(settings.realm, "*"), self.answer)
             log.info("router at %s: %s", ", ".join(settings.listen), self._summary())
             await asyncio.Event().wait()
         finally:
@@ -73,10 +74,6 @@ class Router:
         member = self._plan.roles.names.get(name)
         if member is not None:
             query.answer(payloads.encode(Membership(name=name, role=member.role, robots=member.robots)))
-
-    def _serve(self, bus: Bus) -> None:
-        if self._plan.settings.tls is not None:
-            bus.answer(topics.whoami(self._plan.settings.realm, "*"), self.answer)
 
     def _summary(self) -> str:
         if self._plan.settings.tls is None:

@@ -12,8 +12,7 @@ import msgspec
 import numpy as np
 
 from zbridge.errors import EncodeError, ProtocolError, describe
-from zbridge.protocol.codec import Codec
-from zbridge.protocol.plugin import Protocol
+from zbridge.protocol.plugin import Codec, Protocol
 from zbridge.simulation.check_stage import CheckFinding, raised
 from zbridge.wire import Whole
 from zbridge.wire.fields import CountedArray, Filling

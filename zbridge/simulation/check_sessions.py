@@ -84,7 +84,7 @@ def _silence(rehearsal: Rehearsal, frames: list[bytes]) -> Iterator[str]:
 
 def _lost(rehearsal: Rehearsal, frames: list[bytes]) -> Iterator[str]:
     session = rehearsal.session
-    session.lost("closed by peer")
+    session.fail("closed by peer")
     rehearsal.run(1.0)
     if session.state is not State.CLOSED or session.deadline() is not None or session.receive(frames[0], rehearsal.now):
         yield f"{session!r} still does something when its connection is gone"

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import math
 import socket
 import struct
 from collections.abc import AsyncIterator, Iterable
@@ -79,23 +78,16 @@ def drain(tcp: socket.socket) -> tuple[bytes, str]:
     return data, ""
 
 
-async def readable(sock: socket.socket, most_s: float = math.inf) -> None:
+async def readable(sock: socket.socket, most_s: float | None = None) -> None:
     """Wait until a read would return data, ``most_s`` at most; works with asyncio's and uvloop's loop."""
-    loop = asyncio.get_running_loop()
-    future: asyncio.Future[None] = loop.create_future()
-    loop.add_reader(sock.fileno(), _wake, future)
-    timer = loop.call_later(most_s, _wake, future) if most_s < math.inf else None
+    loop, there = asyncio.get_running_loop(), asyncio.Event()
+    loop.add_reader(sock.fileno(), there.set)
     try:
-        await future
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(most_s):
+                await there.wait()
     finally:
         loop.remove_reader(sock.fileno())
-        if timer is not None:
-            timer.cancel()
-
-
-def _wake(future: asyncio.Future[None]) -> None:
-    if not future.done():
-        future.set_result(None)
 
 
 def _family(host: str) -> socket.AddressFamily:

@@ -188,7 +188,7 @@ class Conversation(Receiver):
             log.debug("%s: %s", self.session.peer, reason)
             self._hooks.linked(self._observed, False)
         self.link = self._observed = self.reading.link = None
-        self.session.lost(reason)
+        self.session.fail(reason)
 
     def writable(self) -> None:
         self.pump()
@@ -263,13 +263,13 @@ class Conversation(Receiver):
     @then_pump
     def cut(self, reason: str) -> None:
         """End the conversation and its link at once, with a reason; what was written may be lost."""
-        self.session.lost(reason)
+        self.session.fail(reason)
         if self.link is not None:
             self.link.abort()
 
     def abandon(self) -> None:
         """End the conversation and its link at once, in any state; idempotent."""
-        self.session.lost("abandoned")
+        self.session.fail("abandoned")
         self._end()
 
     # A restart

@@ -21,6 +21,8 @@ from zbridge.transport.udp import DatagramHub
 
 Accept = Callable[[Receiver], asyncio.BufferedProtocol]
 """``accept(receiver)``: makes the link of an accepted peer."""
+WAITING = 16
+"""Most clients that wait in the kernel's queue; further ones are refused."""
 L = TypeVar("L", bound=asyncio.BaseProtocol)
 
 
@@ -122,3 +124,17 @@ async def make_link(sock: socket.socket, make: Callable[[], L]) -> L:
     if transport.is_closing() and (inner is None or inner.fileno() < 0):
         sock.detach()
     return link
+
+
+async def waiting_sockets(address: Address) -> list[socket.socket]:
+    """Listen at every address of the host; raise OSError if one of them is not available."""
+    loop, sockets = asyncio.get_running_loop(), list[socket.socket]()
+    try:
+        for family, _, _, _, where in await loop.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM):
+            sockets.append(listening := socket.create_server(where, family=family, backlog=WAITING))
+            listening.setblocking(False)
+    except OSError:
+        for listening in sockets:
+            listening.close()
+        raise
+    return sockets

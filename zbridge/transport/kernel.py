@@ -11,46 +11,28 @@ import socket
 import struct
 import termios
 import time
-from typing import Protocol
 
 _OUTSTANDING = struct.Struct("=i")
 _SIOCOUTQ = termios.TIOCOUTQ
 """The ioctl for the unacknowledged bytes of a socket; Python names it for terminals only."""
 
 
-class Kernel(Protocol):
-    """The calls of the operating system that links make."""
+class Kernel:
+    """The calls of the operating system that links make, answered by this machine."""
 
-    def monotonic(self) -> float:
-        """Return seconds on the time line of event loops."""
+    monotonic = staticmethod(time.monotonic)
+    """Return seconds on the time line of event loops."""
+    duplicate = staticmethod(os.dup)
+    """Return another descriptor of the same socket; raise OSError."""
+    close = staticmethod(os.close)
+    """Close a descriptor; raise OSError."""
 
     def adopt(self, descriptor: int) -> socket.socket:
         """Return the socket of a descriptor, which belongs to it from now on."""
-
-    def duplicate(self, descriptor: int) -> int:
-        """Return another descriptor of the same socket; raise OSError."""
-
-    def close(self, descriptor: int) -> None:
-        """Close a descriptor; raise OSError."""
-
-    def datagrams(self, host: str, port: int) -> socket.socket:
-        """Bind a UDP socket that does not block; raise OSError."""
-
-    def unacknowledged(self, sock: socket.socket) -> int:
-        """Count the bytes that the peer has not acknowledged; raise OSError if the platform does not report it."""
-
-
-class _Kernel:
-    """The kernel of this machine."""
-
-    monotonic = staticmethod(time.monotonic)
-    duplicate = staticmethod(os.dup)
-    close = staticmethod(os.close)
-
-    def adopt(self, descriptor: int) -> socket.socket:
         return socket.socket(fileno=descriptor)
 
     def datagrams(self, host: str, port: int) -> socket.socket:
+        """Bind a UDP socket that does not block; raise OSError."""
         sock = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_DGRAM)
         try:
             sock.setblocking(False)
@@ -61,8 +43,9 @@ class _Kernel:
         return sock
 
     def unacknowledged(self, sock: socket.socket) -> int:
+        """Count the bytes that the peer has not acknowledged; raise OSError if the platform does not report it."""
         waiting: int = _OUTSTANDING.unpack(fcntl.ioctl(sock.fileno(), _SIOCOUTQ, bytes(_OUTSTANDING.size)))[0]
         return waiting
 
 
-KERNEL: Kernel = _Kernel()
+KERNEL = Kernel()

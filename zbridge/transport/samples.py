@@ -94,8 +94,7 @@ class ZenohLink(Link):
     def close(self) -> None:
         self._end("closed")
 
-    def abort(self) -> None:
-        self._end("closed")
+    abort = close
 
     async def ended(self) -> None:
         """Wait until the session is closed: a process that ends before would be cut off in the middle of Zenoh."""

@@ -206,22 +206,9 @@ def connect(address: SerialAddress, receiver: Receiver) -> SerialLink:
 
 def attach(address: SerialAddress, descriptor: int, receiver: Receiver) -> SerialLink:
     """Use a line that another process opened and configured."""
-    link = SerialLink(address, _Line(descriptor), receiver)
+    link = SerialLink(address, os.fdopen(descriptor, "r+b", buffering=0), receiver)
     link.begin()
     return link
-
-
-class _Line:
-    """An open line without its settings, which the driver keeps."""
-
-    def __init__(self, descriptor: int) -> None:
-        self._descriptor = descriptor
-
-    def fileno(self) -> int:
-        return self._descriptor
-
-    def close(self) -> None:
-        os.close(self._descriptor)
 
 
 def _opened(address: SerialAddress) -> Any:

@@ -99,11 +99,10 @@ class TlsLink(Link, Receiver):
         return "encrypted by this process"
 
     def close(self) -> None:
-        link, self._link = self._link, None
-        if link is not None:
-            if self._open:
-                self._say_goodbye(link)
-            link.close()
+        if self._open and self._link is not None:
+            with contextlib.suppress(ssl.SSLError):  # do not wait for the peer's close notification
+                self._tls.unwrap()
+        self._end()
 
     def abort(self) -> None:
         link, self._link = self._link, None
@@ -157,15 +156,12 @@ class TlsLink(Link, Receiver):
         if self._link is not None and self._outgoing.pending:
             self._link.write(self._outgoing.read())
 
-    def _say_goodbye(self, link: Link) -> None:
-        with contextlib.suppress(ssl.SSLError):  # do not wait for the peer's close notification
-            self._tls.unwrap()
-        if self._outgoing.pending:
-            link.write(self._outgoing.read())
-
     def _fail(self, why: str) -> None:
-        """End the connection; the alert of TLS, if there is one, is sent."""
         self._why = why
+        self._end()
+
+    def _end(self) -> None:
+        """End the connection; the alert of TLS, if there is one, is sent."""
         self._flush()
         link, self._link = self._link, None
         if link is not None:

@@ -36,7 +36,8 @@ class _DatagramReader:
         self._loop = asyncio.get_running_loop()
         self._suspended = False
 
-    def _listen(self, host: str, port: int) -> None:
+    def open(self, host: str, port: int) -> None:
+        """Bind the port, and read."""
         self._socket = self._kernel.datagrams(host, port)
         self.resume()
 
@@ -109,7 +110,7 @@ class DatagramSocket(_DatagramReader):
         if restored is not None:
             self.restore(restored)
         else:
-            self._listen(transport.get_extra_info("sockname")[0], 0)
+            self.open(transport.get_extra_info("sockname")[0], 0)
 
     def send(self, data: bytes) -> None:
         """Send to the peer."""
@@ -138,10 +139,6 @@ class DatagramHub(_DatagramReader):
         self._owners: dict[tuple[str, int], Link] = {}
         self._sources: dict[Link, tuple[str, int]] = {}
         self._foreign = foreign
-
-    def open(self, host: str, port: int) -> None:
-        """Bind the port."""
-        self._listen(host, port)
 
     def add(self, link: Link, host: str) -> None:
         """Ask this link for the datagrams of its host from now on."""

@@ -53,7 +53,7 @@ class BinaryCodec(Generic[M]):
         if scalars is None:
             if message.byte_order != "<":
                 raise TypeError(f"{message.__name__}: only fields of fixed width can be big-endian")
-            self._steps = [_Step(field, fields[place + 1 :]) for place, field in enumerate(fields)]
+            self._steps = [(field, *_coders(field, fields[place + 1 :])) for place, field in enumerate(fields)]
             self.decode, self.encode = self._decode_steps, self._encode_steps
         else:
             self._fixed = struct.Struct(message.byte_order + scalars)
@@ -71,13 +71,13 @@ class BinaryCodec(Generic[M]):
     def _decode_steps(self, data: bytes, start: int) -> M:
         values = []
         position, end = start, len(data)
-        for step in self._steps:
-            if step.optional and position == end:
+        for field, decode, _ in self._steps:
+            if field.optional and position == end:
                 break
             try:
-                value, position = step.decode(data, position)
+                value, position = decode(data, position)
             except (struct.error, ValueError) as error:
-                raise ProtocolError(f"{self.message.__name__}.{step.name}: {error}") from error
+                raise ProtocolError(f"{self.message.__name__}.{field.name}: {error}") from error
             values.append(value)
         if position != end:
             raise ProtocolError(f"{self.message.__name__}: {end - position} bytes too many")
@@ -87,30 +87,25 @@ class BinaryCodec(Generic[M]):
 
     def _encode_steps(self, message: M) -> bytes:
         parts = []
-        for step in self._steps:
-            value = getattr(message, step.name)
-            if value is None and step.optional:
+        for field, _, encode in self._steps:
+            value = getattr(message, field.name)
+            if value is None and field.optional:
                 break
             try:
-                parts.append(step.encode(value))
+                parts.append(encode(value))
             except (struct.error, ArithmeticError, ValueError, TypeError, AttributeError) as error:
-                raise EncodeError(f"{self.message.__name__}.{step.name}: {error}") from error
+                raise EncodeError(f"{self.message.__name__}.{field.name}: {error}") from error
         return b"".join(parts)
 
 
-class _Step:
-    """One field of a message of variable length."""
-
-    def __init__(self, field: Field, behind: Sequence[Field]) -> None:
-        self.name = field.name
-        self.optional = field.optional
-        if isinstance(field.wire, Filling):
-            scalars = _all_scalars(behind)
-            if scalars is None:
-                raise TypeError(f"{field.name}: only fields of fixed width may follow it")
-            self.decode, self.encode = _filling(field.wire, struct.calcsize("<" + scalars))
-        else:
-            self.decode, self.encode = _CODERS[type(field.wire)](field.wire)
+def _coders(field: Field, behind: Sequence[Field]) -> tuple[Decode, Encode]:
+    """Return how one field of a message of variable length is read and written."""
+    if not isinstance(field.wire, Filling):
+        return _CODERS[type(field.wire)](field.wire)
+    scalars = _all_scalars(behind)
+    if scalars is None:
+        raise TypeError(f"{field.name}: only fields of fixed width may follow it")
+    return _filling(field.wire, struct.calcsize("<" + scalars))
 
 
 def _all_scalars(fields: Sequence[Field]) -> str | None:

@@ -6,15 +6,13 @@ text codec. A reader also takes a carriage return before the line feed.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable
 from typing import ClassVar, Generic, TypeVar
 
 from zbridge.errors import ProtocolError
 from zbridge.wire.fields import Message
-from zbridge.wire.text import TextCodec
+from zbridge.wire.text import NUMBER, TextCodec
 
-_NUMBER = re.compile(rb"-?[0-9]*\.?[0-9]+")
 _QUOTED = 64
 
 
@@ -47,7 +45,7 @@ class Lines(Generic[L]):
         codec = self._codecs.get(word)
         if codec is None:
             raise ProtocolError(f"{frame[:_QUOTED]!r} begins no message")
-        if not all(map(_NUMBER.fullmatch, numbers)):
+        if not all(map(NUMBER.fullmatch, numbers)):
             raise ProtocolError(f"{frame[:_QUOTED]!r}: expected numbers")
         return codec.decode(b"|".join(numbers))
 

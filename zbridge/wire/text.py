@@ -17,7 +17,7 @@ from zbridge.wire.fields import Decimal, Field, Filling, Ints, Message, Scalar, 
 
 M = TypeVar("M", bound=Message)
 
-_NUMBER = re.compile(rb"-?[0-9]*\.?[0-9]+")
+NUMBER = re.compile(rb"-?[0-9]*\.?[0-9]+")
 _QUOTED = 24
 _DIGITS = b"0123456789"
 _UNCLIPPED = 2**63 - 2
@@ -43,7 +43,7 @@ class TextCodec(Generic[M]):
         if self._array is not None:
             values = self._with_array(body, self._array)
         else:
-            numbers = _NUMBER.findall(body)
+            numbers = NUMBER.findall(body)
             if len(numbers) != len(self._fields):
                 raise ProtocolError(f"{self._name} of {len(numbers)} fields, expected {len(self._fields)}")
             values = [self._read(field, number) for field, number in zip(self._fields, numbers, strict=True)]
@@ -95,18 +95,16 @@ class _TextField:
         self.whole = kind if isinstance(kind, Whole) else None
         self.read: Callable[[bytes], Any]
         self.write: Callable[[Any], bytes]
-        self.read, self.write = (_integers, _write_array) if self.array else _coder(field)
-
-
-def _coder(field: Field) -> tuple[Callable[[bytes], Any], Callable[[Any], bytes]]:
-    if not isinstance(field.wire, Scalar):
-        raise TypeError(f"{field.name}: {field.wire} has no form in text")
-    kind = _kind(field)
-    if kind is None:
-        return _read_truth, lambda value: b"1" if value else b"0"
-    if isinstance(kind, Decimal):
-        return _read_decimal, _write_decimal
-    return _whole(kind)
+        if self.array:
+            self.read, self.write = _integers, _write_array
+        elif not isinstance(field.wire, Scalar):
+            raise TypeError(f"{field.name}: {field.wire} has no form in text")
+        elif isinstance(kind, Whole):
+            self.read, self.write = _whole(kind)
+        elif isinstance(kind, Decimal):
+            self.read, self.write = _read_decimal, _write_decimal
+        else:
+            self.read, self.write = _read_truth, lambda value: b"1" if value else b"0"
 
 
 def _kind(field: Field) -> Whole | Decimal | None:
@@ -183,7 +181,7 @@ def _integers(body: bytes) -> Ints:
 def _integers_one_by_one(body: bytes) -> Ints:
     import numpy as np
 
-    numbers = _NUMBER.findall(body)
+    numbers = NUMBER.findall(body)
     try:
         return np.array([int(number) for number in numbers], np.int64)
     except (ValueError, OverflowError) as error:

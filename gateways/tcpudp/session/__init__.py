@@ -14,7 +14,6 @@ from gateways.tcpudp.messages import (
     DebugMessage,
     OpaquePacket,
     Packet,
-    PacketSender,
     decoder,
     encode_packet,
     frame_end,
@@ -23,7 +22,6 @@ from zbridge.protocol import Limits, ProtocolError, Role, Session
 
 HANDSHAKE_S = 5.0
 _QUOTED = 80
-_OWN = {Role.HQ: PacketSender.HQ, Role.ROBOT: PacketSender.ROBOT}
 
 Decode = Callable[[bytes, int], Packet]
 
@@ -35,9 +33,8 @@ def limits(gap_s: float) -> Limits:
 
 def decoders(role: Role) -> dict[int, Decode]:
     """Tabulate, by packet id, how to read what the peer of ``role`` may send."""
-    own = _OWN[role]
     return {
-        number: decoder(number) for number in range(256) if number not in PACKETS or PACKETS[number].sender is not own
+        number: decoder(number) for number in range(256) if number not in PACKETS or PACKETS[number].sender is not role
     }
 
 
@@ -60,7 +57,7 @@ class PacketSession(Session[Packet]):
         """Make the error for a packet that the peer may not send."""
         sender_id, packet_id = frame[4], frame[5]
         spec = PACKETS.get(packet_id)
-        if spec is not None and spec.sender is _OWN[self.role]:
+        if spec is not None and spec.sender is self.role:
             return ProtocolError(f"{spec.name} ({packet_id}) from the wrong side")
         return ProtocolError(f"packet {packet_id} with id {sender_id}, which is not the peer's")
 

@@ -18,8 +18,8 @@ client's source in two ways only:
   (:meth:`ClientSource.claims_late`): a program of 1.3 whose 5 was lost sends 11, 12 and 61 by UDP all the same. If it
   has another source then, one of the two is not the client, and the session no longer accepts datagrams of either.
 
-The session calls :meth:`ClientSource.bind` with the first datagram that it is given, and :meth:`ClientSource.lose` when
-a rival shows up.
+The session sets :attr:`ClientSource.bound` with the first datagram that it is given, and calls
+:meth:`ClientSource.lose` when a rival shows up.
 """
 
 from __future__ import annotations
@@ -56,7 +56,6 @@ FROM_HQ: dict[int, Decode] = decoders(Role.ROBOT)
 """How to read what an HQ program may send, by packet id."""
 _UNASSIGNED = (0, packets.SERVER_ID)
 """The ``id`` bytes that no client is given."""
-_NO_HEADER = (-1, -1)
 _PROBE = packets.ClientUDPConnection.spec.id
 
 
@@ -68,7 +67,7 @@ class ClientSource(Kept):
     def __init__(self, client_id: int, client_port: int) -> None:
         self.client_port = client_port
         self.bound = False
-        """True while datagrams come from a port that counts as the client's."""
+        """True while datagrams come from a port that counts as the client's: that of the last claim."""
         self._client_id = client_id
         self._port = 0
         self._contested = False
@@ -90,22 +89,10 @@ class ClientSource(Kept):
         sender_id, packet_id = _header(datagram)
         return self._claim(port) if sender_id == self._client_id and packet_id in FROM_HQ else False
 
-    def bind(self) -> None:
-        """Take the port of the last claim for the client's."""
-        self.bound = True
-
     def lose(self, *, for_good: bool = False) -> None:
         """Have no source; ``for_good``: let none be claimed late."""
         self.bound = False
         self._contested = self._contested or for_good
-
-    def sender_of(self, datagram: bytes) -> int:
-        """Return the ``id`` byte of a datagram; -1 if it is no packet."""
-        return _header(datagram)[0]
-
-    def accepts_sender(self, sender_id: int) -> bool:
-        """Accept the ``id`` bytes of the client's datagrams, and -1, which decoding will refuse."""
-        return sender_id in (_NO_HEADER[0], self._client_id, *_UNASSIGNED)
 
     def _claim(self, port: int) -> bool:
         if not self.bound:
@@ -114,11 +101,11 @@ class ClientSource(Kept):
 
 
 def _header(datagram: bytes) -> tuple[int, int]:
-    """Return the ``id`` byte and the packet id of a datagram; -1 each if it is not one packet."""
+    """Return the ``id`` byte and the packet id of a datagram; -1 each, which decoding refuses, if it is no packet."""
     try:
         return packets.read_header(datagram)
     except ProtocolError:
-        return _NO_HEADER
+        return -1, -1
 
 
 PROBE_S = 2.0
@@ -235,7 +222,7 @@ class RobotRole(PacketSession, SourceClaims):
             raise ProtocolError(f"{type(message).__name__} before clientSettings")
         elif isinstance(message, packets.ClientUDPConnectionStatus):
             confirmed = message.connected and now < self._report_until
-            self._fire(RobotEvent.REPORT_TRUE if confirmed else RobotEvent.REPORT_FALSE, now)
+            self._fire(RobotEvent.REPORT_TRUE if confirmed else RobotEvent.REPORT_FALSE, message, now)
         elif isinstance(message, packets.ClientUDPConnection):
             raise ProtocolError("clientUDPConnection by TCP")
         else:
@@ -253,7 +240,8 @@ class RobotRole(PacketSession, SourceClaims):
         self._agreed = agreed
         row = newest((agreed,), known=VERSIONS)
         self.known = self._also_known | (VERSIONS[row].known_to_hq if row is not None else frozenset())
-        self._fire(RobotEvent.SETTINGS_UDP if self.settings.udp and self.client.udp else RobotEvent.SETTINGS_TCP, now)
+        udp = self.settings.udp and self.client.udp
+        self._fire(RobotEvent.SETTINGS_UDP if udp else RobotEvent.SETTINGS_TCP, message, now)
 
     # Datagrams
 
@@ -276,23 +264,23 @@ class RobotRole(PacketSession, SourceClaims):
 
     def stray(self, datagram: bytes) -> None:
         """Count a datagram with this client's id from an unknown port; raise NotReady with a text for the client."""
-        if self.state is State.ESTABLISHED and self._source.sender_of(datagram) == self.client_id:
+        if self.state is State.ESTABLISHED and _header(datagram)[0] == self.client_id:
             self.traffic.foreign += 1
             text = "packets by UDP from another port than this client's are not taken"
             raise NotReady(f"{text} (client_port = {self._source.client_port})")
 
     def receive_datagram(self, datagram: bytes, now: float) -> list[packets.Packet]:
         """Take one datagram of the client's source, unless it has the id of another client."""
-        self._source.bind()
-        sender_id = self._source.sender_of(datagram)
-        if self._source.accepts_sender(sender_id):
+        self._source.bound = True
+        sender_id, _ = _header(datagram)
+        if sender_id in (-1, self.client_id, *_UNASSIGNED):
             return super().receive_datagram(datagram, now)
         self.malformed(f"datagram with id {sender_id}, which is another client's")
         return []
 
     def accept_datagram(self, message: packets.Packet, now: float) -> bool:
         if isinstance(message, packets.ClientUDPConnection):
-            self._fire(RobotEvent.PROBE, now)
+            self._fire(RobotEvent.PROBE, message, now)
             return False
         if self.state is not State.ESTABLISHED:  # until the 7 the source may be somebody else's
             raise ProtocolError(f"{type(message).__name__} by UDP before the handshake is over")
@@ -308,10 +296,10 @@ class RobotRole(PacketSession, SourceClaims):
 
     # Actions of the table
 
-    def _fire(self, event: RobotEvent, now: float) -> None:
+    def _fire(self, event: RobotEvent, message: packets.Packet, now: float) -> None:
         """Take a message of the handshake; raise ProtocolError if it is not due."""
         if not self._handshake.fire(event, now):
-            raise ProtocolError(f"{_MESSAGES[event]} was not due")
+            raise ProtocolError(f"{message.spec.name} was not due")
 
     def _offer_udp(self, now: float) -> None:
         """Send 4; the time limit of the settings ends."""
@@ -348,11 +336,6 @@ class RobotRole(PacketSession, SourceClaims):
         self.establish(self._agreed, tuple(feature.value for feature in self.client.features))
 
 
-_MESSAGES = {
-    RobotEvent.PROBE: "clientUDPConnection",
-    RobotEvent.REPORT_TRUE: "clientUDPConnectionStatus",
-    RobotEvent.REPORT_FALSE: "clientUDPConnectionStatus",
-}
 TABLE: dict[RobotStep, dict[RobotEvent, tuple[Callable[[RobotRole, float], None], RobotStep]]] = {
     RobotStep.GREETED: {
         RobotEvent.SETTINGS_UDP: (RobotRole._offer_udp, RobotStep.PROBED),

@@ -16,8 +16,7 @@ from zbridge.fleet.messages import Drive, FleetMessage, Pose
 from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
-from zbridge.protocol.codec import Codec
-from zbridge.protocol.plugin import Outcome, Protocol, RobotSide, Simulation, Telemetry, Translate
+from zbridge.protocol.plugin import Codec, Outcome, Protocol, RobotSide, Simulation, Telemetry, Translate
 from zbridge.protocol.session import Limits, Role, Session
 
 TEMPLATE = """\

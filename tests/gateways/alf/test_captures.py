@@ -36,7 +36,8 @@ def told(robot: AlfRobot, name: str, port: int) -> list[tuple[Topic, FleetMessag
 
 
 def test_the_gateway_as_hq_drives_as_the_recorded_hq_did_and_answers_the_end() -> None:
-    link = AlfHqRole(TEXT, drives=DriveCommand(0, 0, 0, False))
+    link = AlfHqRole(TEXT)
+    link.at_first = DriveCommand(0, 0, 0, False)
     link.open(0.0006)
     sent: list[bytes] = []
     now = 0.0006

@@ -14,7 +14,9 @@ from zbridge.protocol.session import Role, State
 
 def hq(dialect: AlfDialect = TEXT, **options: Any) -> Any:
     """The session of a link that drives."""
-    return session(AlfHqRole, dialect, drives=STANDS[dialect], **options)
+    made = session(AlfHqRole, dialect, **options)
+    made.drive(STANDS[dialect], 0.0)
+    return made
 
 
 def until(session: Any, end: float, *driven: tuple[float, DriveCommand]) -> list[tuple[float, bytes]]:
@@ -134,7 +136,8 @@ def test_no_command_goes_behind_end_neither_the_newest_nor_one_that_comes_while_
 
 
 def test_a_session_that_was_closed_before_its_link_was_up_says_nothing() -> None:
-    link = AlfHqRole(TEXT, drives=STANDS[TEXT])
+    link = AlfHqRole(TEXT)
+    link.at_first = STANDS[TEXT]
     link.close("gateway stopped", 0.0)
     link.open(0.0)
     assert drained(link, 0.0) == []

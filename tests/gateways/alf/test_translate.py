@@ -333,7 +333,7 @@ def test_only_the_drive_link_gets_commands_and_both_give_telemetry() -> None:
     assert (wire.robot.link_names, Wire().robot.link_names) == (("drive", "laser"), ("vehicle",))
     assert (wire.robot.driving, wire.robot.dialect) == (wire.sessions[0], "text")
     assert wire.command("forward 0.5") == b"3|50|0|0|0;"
-    wire.sessions[1].lost("closed by peer")
+    wire.sessions[1].fail("closed by peer")
     wire.connect(1)
     assert wire.robot.ready
     assert wire.sent() == b"3|50|0|0|0;", "a lost laser link leaves the drive as it is"

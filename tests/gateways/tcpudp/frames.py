@@ -157,7 +157,7 @@ class Stage:
 
     def connect(self, settings: bytes) -> None:
         """Lose the connection and connect again."""
-        self.session.lost("closed by peer")
+        self.session.fail("closed by peer")
         self.timed = self._connected(settings, self.now)
 
     def hand_over(self) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from gateways.tcpudp import messages as m
 from tests.conformance.side import Side, framed
+from zbridge.protocol.session import Role
 
 
 def block(*fields: Any) -> bytes:
@@ -80,29 +81,29 @@ GOLDEN: list[tuple[Any, int, str]] = [
 
 # id: (name, sender, carrier). Packet 6 goes by UDP when it says true and by TCP when it says false.
 TABLE = {
-    1: ("debugMessage", m.PacketSender.BOTH, m.Carrier.TCP),
-    2: ("serverSettings", m.PacketSender.ROBOT, m.Carrier.TCP),
-    3: ("clientSettings", m.PacketSender.HQ, m.Carrier.TCP),
-    4: ("serverStartUDP", m.PacketSender.ROBOT, m.Carrier.TCP),
-    5: ("clientUDPConnection", m.PacketSender.HQ, m.Carrier.UDP),
-    6: ("serverUDPConnection", m.PacketSender.ROBOT, m.Carrier.UDP),
-    7: ("clientUDPConnectionStatus", m.PacketSender.HQ, m.Carrier.TCP),
-    10: ("clientControllMode", m.PacketSender.HQ, m.Carrier.TCP),
-    11: ("clientJoystickMove", m.PacketSender.HQ, m.Carrier.UDP_IF_AGREED),
-    12: ("clientJoystickRotate", m.PacketSender.HQ, m.Carrier.UDP_IF_AGREED),
-    13: ("clientJoystickStop", m.PacketSender.HQ, m.Carrier.TCP),
-    21: ("clientMoveAI", m.PacketSender.HQ, m.Carrier.TCP),
-    31: ("serverCamMode", m.PacketSender.ROBOT, m.Carrier.TCP),
-    40: ("chatMessage", m.PacketSender.BOTH, m.Carrier.TCP),
-    50: ("clientLidarMode", m.PacketSender.HQ, m.Carrier.TCP),
-    51: ("serverLidarStatus", m.PacketSender.ROBOT, m.Carrier.TCP),
-    52: ("clientGetSLAMMap", m.PacketSender.HQ, m.Carrier.TCP),
-    53: ("servertSLAMMap", m.PacketSender.ROBOT, m.Carrier.UDP_IF_AGREED),
-    54: ("clientGetPosition", m.PacketSender.HQ, m.Carrier.TCP),
-    55: ("serverPosition", m.PacketSender.ROBOT, m.Carrier.UDP_IF_AGREED),
-    56: ("servertSLAMMapPart", m.PacketSender.ROBOT, m.Carrier.UDP_IF_AGREED),
-    60: ("serverGetSimulatedLidarData", m.PacketSender.ROBOT, m.Carrier.TCP),
-    61: ("clientSimulatedLidarData", m.PacketSender.HQ, m.Carrier.UDP_IF_AGREED),
+    1: ("debugMessage", None, m.Carrier.TCP),
+    2: ("serverSettings", Role.ROBOT, m.Carrier.TCP),
+    3: ("clientSettings", Role.HQ, m.Carrier.TCP),
+    4: ("serverStartUDP", Role.ROBOT, m.Carrier.TCP),
+    5: ("clientUDPConnection", Role.HQ, m.Carrier.UDP),
+    6: ("serverUDPConnection", Role.ROBOT, m.Carrier.UDP),
+    7: ("clientUDPConnectionStatus", Role.HQ, m.Carrier.TCP),
+    10: ("clientControllMode", Role.HQ, m.Carrier.TCP),
+    11: ("clientJoystickMove", Role.HQ, m.Carrier.UDP_IF_AGREED),
+    12: ("clientJoystickRotate", Role.HQ, m.Carrier.UDP_IF_AGREED),
+    13: ("clientJoystickStop", Role.HQ, m.Carrier.TCP),
+    21: ("clientMoveAI", Role.HQ, m.Carrier.TCP),
+    31: ("serverCamMode", Role.ROBOT, m.Carrier.TCP),
+    40: ("chatMessage", None, m.Carrier.TCP),
+    50: ("clientLidarMode", Role.HQ, m.Carrier.TCP),
+    51: ("serverLidarStatus", Role.ROBOT, m.Carrier.TCP),
+    52: ("clientGetSLAMMap", Role.HQ, m.Carrier.TCP),
+    53: ("servertSLAMMap", Role.ROBOT, m.Carrier.UDP_IF_AGREED),
+    54: ("clientGetPosition", Role.HQ, m.Carrier.TCP),
+    55: ("serverPosition", Role.ROBOT, m.Carrier.UDP_IF_AGREED),
+    56: ("servertSLAMMapPart", Role.ROBOT, m.Carrier.UDP_IF_AGREED),
+    60: ("serverGetSimulatedLidarData", Role.ROBOT, m.Carrier.TCP),
+    61: ("clientSimulatedLidarData", Role.HQ, m.Carrier.UDP_IF_AGREED),
 }
 
 # What the captures say after the handshake, read off the hex: 9a99193f is the float32 next to 0.6, cdcc4c3f that next

@@ -134,7 +134,7 @@ def test_a_robot_is_ready_while_its_session_is_established_and_refuses_all_befor
     assert connected.robot.ready
     connected.robot.stop(connected.now, connected.now)
     assert connected.after(1.0) == [bearing(STOP, 2)]
-    connected.session.lost("gone")
+    connected.session.fail("gone")
     assert not connected.robot.ready
 
 

@@ -16,21 +16,21 @@ from gateways.wc2ec.messages import (
     SetSensor,
     SetValue,
     Wc2EcDialect,
-    Wc2EcSender,
     frame_end,
     read,
     write,
 )
 from tests.conformance.side import Side, framed
+from zbridge.protocol.session import Role
 
 DRAFT, DEPLOYED = Wc2EcDialect.DRAFT, Wc2EcDialect.DEPLOYED
-WC, EC = Wc2EcSender.WC, Wc2EcSender.EC
+WC, EC = Role.ROBOT, Role.HQ
 VALUES = 3
 """Configuration values of a sensor: a setting."""
 LONG = bytes(range(1, 256))
 """A name of 255 bytes that is not UTF-8."""
 
-GOLDEN: dict[tuple[Wc2EcDialect, Wc2EcSender], list[tuple[Any, bytes]]] = {
+GOLDEN: dict[tuple[Wc2EcDialect, Role], list[tuple[Any, bytes]]] = {
     (DEPLOYED, WC): [
         (RegisterSensor(53, 0, b"wheel1"), bytes.fromhex("00 35 00 06 77 68 65 65 6c 31")),
         (RegisterSensor(255, 254, b""), bytes.fromhex("00 ff fe 00")),
@@ -60,7 +60,7 @@ GOLDEN: dict[tuple[Wc2EcDialect, Wc2EcSender], list[tuple[Any, bytes]]] = {
 }
 
 
-def _side(dialect: Wc2EcDialect, sender: Wc2EcSender) -> Side:
+def _side(dialect: Wc2EcDialect, sender: Role) -> Side:
     golden = GOLDEN[dialect, sender]
     end = frame_end(dialect, sender, values=VALUES)
 
@@ -69,7 +69,7 @@ def _side(dialect: Wc2EcDialect, sender: Wc2EcSender) -> Side:
         return read(frame, dialect)
 
     return Side(
-        f"wc2ec-{dialect.value}-{sender.name.lower()}",
+        f"wc2ec-{dialect.value}-{'wc' if sender is WC else 'ec'}",
         golden,
         of_dialect,
         lambda message: write(message, dialect),

@@ -133,7 +133,7 @@ class Scene(HqScene):
                 case ["client"]:
                     self.connect()
                 case [client, "leaves"]:
-                    self.clients[int(client)].lost("EOF")
+                    self.clients[int(client)].fail("EOF")
                 case [client, "sets", number, value, ">", *expected]:
                     assert self.sets(int(number), float(value), int(client)) == " ".join(expected), step
                 case [client, *expected]:
@@ -286,7 +286,7 @@ def test_numbers_of_names_that_are_gone_are_given_to_others_but_never_while_a_co
         scene.play(f"robot goes; table {' '.join(f'{name}/distance' for name in names)}; is wc2ec; client")
         assert understood(scene.told(connection)).startswith(" ".join(f"{name}/37" for name in names))
         if connection < 4:
-            scene.clients[connection].lost("gone")
+            scene.clients[connection].fail("gone")
     assert most_kept(scene.side, depth=2) == 255
     scene.play("table new/0/distance; reads new/0 1; 4:")
 
@@ -513,6 +513,7 @@ def test_what_a_webots_robot_sent_passes_the_bus_and_reaches_a_controller_as_it_
             scene.tell(topic, payload.decode(topic.message, payload.encode(telemetry)))
         written += scene.told()
     assert written == sent.replace(b"\x00\x2e\x01\x01a", b"\x00\x2e\x01\x03a#1")
+    drained(session)  # the stops of motors that came in the read that established the session
     motor = next(one.number for one in Reader("deployed").take(sent) if one.node_type in (ROTATIONAL, LINEAR))
     ((topic, command),) = scene.says(set_value(motor, 0.5))
     robot.command(topic, command, 0.0)

@@ -106,7 +106,7 @@ def test_an_unknown_command_ends_the_session_with_its_bytes_in_the_reason(make, 
 def test_an_end_within_a_message_delivers_nothing_of_it() -> None:
     session = external()
     assert session.receive(WHEEL + READING + READING[:10], 0.1) == [WHEEL_MESSAGE, READING_MESSAGE]
-    session.lost("closed by peer")
+    session.fail("closed by peer")
     assert session.state is State.CLOSED
     assert (session.reason or "").startswith("closed by peer")
 

@@ -81,8 +81,10 @@ class Wire:
 
     @classmethod
     def of(cls, robot: str) -> Self:
-        """One of the ROBOTS; those of legacy programs are the CAR, which has sent data."""
-        return cls(b"" if robot.startswith("draft") else READY, **ROBOTS[robot])
+        """One of the ROBOTS; those of legacy programs are the CAR, which has sent data, and was sent its stop."""
+        made = cls(b"" if robot.startswith("draft") else READY, **ROBOTS[robot])
+        made.frames()
+        return made
 
     def connect(self, greeting: bytes = b"") -> tuple[tuple[Topic, FleetMessage], ...]:
         """Connect, for the first time or again; give what the fleet is told at once."""
@@ -233,12 +235,19 @@ def test_a_number_that_is_registered_twice_is_a_protocol_error_and_changes_nothi
 
 
 def test_a_new_connection_begins_with_a_fresh_table(car: Wire) -> None:
-    car.session.lost("closed by peer")
+    car.session.fail("closed by peer")
     car.connect()
     car.play(["refused motor/fl value=1"])
     assert car.table(registration(DISTANCE, 0, b"fl")) == [Device("fl", 0, "distance")]
     car.play(["refused motor/fl value=1"])
     assert car.reading(data(5, 1.0))[0] == "sensor/distance-5"
+
+
+def test_motors_that_come_in_the_read_that_establishes_the_session_or_later_are_stopped() -> None:
+    wire = Wire(READY, **ROBOTS["car"])
+    assert wire.values() == STOPPED
+    wire.told(registration(ROTATIONAL, 9, b"arm") + registration(LINEAR, 10, b"lift two"))
+    assert wire.values() == {9: 0.0}
 
 
 def test_255_devices_may_be_registered_and_every_rotational_motor_is_stopped_at_once() -> None:
@@ -324,7 +333,9 @@ def test_sensors_with_bearings_are_a_scan_too_once_each_has_a_value_of_this_conn
     ROBOTS,
 )
 def test_what_is_told_of_the_robot_and_what_leaves_for_it(options: dict[str, Any], steps: list[str]) -> None:
-    Wire(b"" if "dialect" in options else READY, **options).play(steps)
+    wire = Wire(b"" if "dialect" in options else READY, **options)
+    wire.frames()
+    wire.play(steps)
 
 
 def test_a_webots_robot_cannot_be_asked_for_anything(car: Wire) -> None:
@@ -401,13 +412,13 @@ def test_a_sensor_of_the_draft_is_enabled_while_somebody_listens_and_a_pinned_on
     ):
         wire.robot.listened(topic, on=on)
         assert b"".join(wire.frames()) == bytes.fromhex(sent)
-    wire.session.lost("closed by peer")
+    wire.session.fail("closed by peer")
     wire.robot.listened(one, on=False)
     wire.robot.listened(two, on=True)
     for _ in range(2):  # who listens while nobody is connected is remembered for every connection
         wire.connect()
         assert wire.frames() == [bytes.fromhex("80 00 01"), bytes.fromhex("80 00 02")]
-        wire.session.lost("closed by peer")
+        wire.session.fail("closed by peer")
 
 
 def test_all_sensors_may_be_pinned_and_are_enabled_at_once() -> None:

@@ -11,8 +11,7 @@ import time
 from typing import Any
 
 from tests.simulated.bus_validation.agent import Agent
-from zbridge.bus import BusSettings, open_router
-from zbridge.bus.zenoh import open_zenoh
+from zbridge.bus import BusSettings, open_bus, open_router
 from zbridge.metrics import Metrics
 from zbridge.security.router_settings import RouterSettings, plan_router, zenoh_values
 
@@ -40,7 +39,7 @@ async def main(listen: str, connect: str) -> None:
         bus: Any = await open_router(zenoh_values(plan), Metrics(), lambda neighbour, here: None)
     else:
         settings = BusSettings(mode="client", connect=connects, multicast=False)
-        bus = await open_zenoh(settings, Metrics(), within_s=5.0)
+        bus = await open_bus(settings, Metrics(), within_s=5.0)
     record("opened")
     agent = Agent(bus, record, time.monotonic)
     while (word := await words.get())[0] != "end":

@@ -54,6 +54,7 @@ class PlayedSource(ViewerSource):
     def __init__(self, hub: Hub) -> None:
         super().__init__(hub)
         self.commands = self  # type: ignore[assignment]
+        self.greeting = "hello"
         self.done: list[tuple[Any, ...]] = []
         self.fails: Exception | None = None
         self.goes_on = asyncio.Event()
@@ -63,7 +64,8 @@ class PlayedSource(ViewerSource):
         return [Service(1, "/stop", "zbridge/Stop", {}, {})]
 
     def greet(self, viewer: Subscriber) -> None:
-        viewer.say("hello")
+        if self.greeting:
+            viewer.say(self.greeting)
 
     def published(self, viewer: Subscriber, channel: ClientChannel, payload: bytes) -> None:
         self.done.append((channel.topic, payload))
@@ -236,9 +238,13 @@ async def test_a_viewer_that_takes_nothing_for_long_is_ended() -> None:
     assert scene.source.done == [("left",)]
 
 
-async def test_a_viewer_that_has_nothing_to_read_is_kept(scene: Scene) -> None:
+@pytest.mark.parametrize("greeting", ["hello", ""])
+async def test_a_viewer_that_has_nothing_to_read_is_kept(greeting: str) -> None:
+    scene = Scene()
+    scene.source.greeting = greeting
     await asyncio.sleep(100 * SEND_S)
     assert not scene.running.done()
+    await scene.ends()
 
 
 # What it publishes

@@ -61,6 +61,15 @@ def test_keys_and_times_choose_what_is_written(recording: Path, tmp_path: Path) 
     assert export_tables(recording, tmp_path / "out", chosen).messages == 5
 
 
+def test_more_tables_than_a_folder_should_hold_are_refused(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(export, "TABLES", 3)
+    with pytest.raises(ConfigError, match="more than 3 keys: choose some by --keys"):
+        export_tables(recording, tmp_path / "out", Selection())
+    assert export_tables(recording, tmp_path / "fewer", Selection("fleet/r1/*")).files == 2
+
+
 def test_more_than_memory_should_hold_is_refused(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

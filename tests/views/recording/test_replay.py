@@ -40,6 +40,12 @@ def recording(tmp_path: Path) -> Path:
     return files.written(tmp_path / "a.mcap", TOLD)
 
 
+def test_a_survey_has_the_first_established_status_of_each_robot(recording: Path) -> None:
+    seen = survey(recording)
+    assert seen.robots == ("r1", "r2")
+    assert {name: status.protocol for name, status in seen.statuses.items()} == {"r1": "tcpudp"}
+
+
 class Stage:
     """A replay of r1 as ``again`` on a fake bus."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.bounds import most_kept
-from zbridge.errors import Refused
+from zbridge.errors import Held, Refused
 from zbridge.lease.stick import StickAction
 from zbridge.views.ros2.driving import PUBLISHERS, REMEMBERED, Driving, TwistPublisher
 
@@ -154,6 +154,16 @@ def say(driving: Driving, gid: bytes, moving: bool, now: float, wrong: str = "")
     if action is StickAction.ACQUIRE:
         publisher.stick.granted()
     return "" if action is StickAction.NOTHING else action.value
+
+
+def test_who_moves_beside_the_driver_is_told_that_another_one_holds_the_robot() -> None:
+    driving = Driving("r1")
+    for gid, name in ((A, "/a"), (B, "/b")):
+        driving.came(gid, name, 0.0, early=False)
+    assert say(driving, A, True, 0.0) == "acquire"
+    with pytest.raises(Held, match="r1 is driven by /a"):
+        driving.heard(B, True, 0.1)
+    assert driving.driver is driving.publishers[A]
 
 
 @pytest.mark.parametrize("story", STORIES)

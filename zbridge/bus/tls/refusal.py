@@ -197,22 +197,16 @@ async def _on_thread(
     work: Callable[[str, Tls | None], Finding | None], endpoint: str, tls: Tls | None
 ) -> Finding | None:
     """Run a blocking call on a thread that may be abandoned; None if it takes too long, or fails itself."""
-    loop = asyncio.get_running_loop()
-    done: asyncio.Future[Finding | None] = loop.create_future()
-
-    def tell(finding: Finding | None) -> None:
-        if not done.done():
-            done.set_result(finding)
+    loop, done, found = asyncio.get_running_loop(), asyncio.Event(), list[Finding | None]()
 
     def run() -> None:
-        finding = None
         with contextlib.suppress(ConfigError, OSError, ValueError):  # the files have changed meanwhile
-            finding = work(endpoint, tls)
+            found.append(work(endpoint, tls))
         with contextlib.suppress(RuntimeError):  # the loop has ended
-            loop.call_soon_threadsafe(tell, finding)
+            loop.call_soon_threadsafe(done.set)
 
     threading.Thread(target=run, name="zbridge-why-not", daemon=True).start()
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(LONGEST_S + 0.5):
-            return await done
-    return None
+            await done.wait()
+    return found[0] if done.is_set() and found else None

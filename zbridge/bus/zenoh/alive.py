@@ -11,7 +11,7 @@ from collections.abc import Callable
 from functools import partial
 
 from zbridge.bus.interface import Handle
-from zbridge.bus.zenoh.declared import Undo
+from zbridge.bus.zenoh.declared import undoing
 
 log = logging.getLogger("zbridge.bus")
 
@@ -43,7 +43,7 @@ class AliveWatches:
         watch.watchers.append(watcher)
         if watch.tokens:
             self._loop.call_soon(watcher.greet, watch.tokens)
-        return Undo(partial(self._remove, key_expr, watch, watcher))
+        return undoing(partial(self._remove, key_expr, watch, watcher))
 
     def _remove(self, key_expr: str, watch: _Watch, watcher: _Watcher) -> None:
         watcher.gone = True

@@ -16,7 +16,7 @@ from typing import Any
 import zenoh
 
 from zbridge.bus.interface import Handle
-from zbridge.bus.zenoh.declared import Declared, Undo
+from zbridge.bus.zenoh.declared import Declared, undoing
 from zbridge.fleet.topics import is_concrete
 
 Take = Callable[[Any], None]
@@ -39,7 +39,7 @@ class Answers:
         """Answer for all keys below ``key_expr``, which ends with ``/**``, with one queryable from now on."""
         gathered = _Gathered(self._session, key_expr)
         self._gathered.append(gathered)
-        return Undo(lambda: self._gathered.remove(gathered))
+        return undoing(lambda: self._gathered.remove(gathered))
 
     def add(self, key: str, take: Take) -> Handle:
         """Pass queries for ``key``, whose last chunk may be ``*``, to ``take``."""
@@ -68,7 +68,7 @@ class _Gathered:
         self._takes = {**self._takes, key: take}  # replaced as a whole: Zenoh's thread reads it meanwhile
         if self._queryable is None:
             self._queryable = Declared(self._session.declare_queryable(self._key_expr, self._take))
-        return Undo(partial(self._remove, key))
+        return undoing(partial(self._remove, key))
 
     def _remove(self, key: str) -> None:
         self._takes = {other: take for other, take in self._takes.items() if other != key}

@@ -12,6 +12,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import zenoh
@@ -75,22 +76,9 @@ class Declared:
             _undeclare_soon(entity)
 
 
-class Undo:
-    """A handle that undoes something once."""
-
-    def __init__(self, undo: Callable[[], object]) -> None:
-        self._undo: Callable[[], object] | None = undo
-
-    @property
-    def closed(self) -> bool:
-        """Whether it was undone."""
-        return self._undo is None
-
-    def close(self) -> None:
-        """Undo it; idempotent."""
-        undo, self._undo = self._undo, None
-        if undo is not None:
-            undo()
+def undoing(undo: Callable[[], object]) -> Declared:
+    """Make a handle that undoes something once, as what was declared otherwise than on the session."""
+    return Declared(SimpleNamespace(undeclare=undo))
 
 
 def _undeclare_soon(entity: Any) -> None:

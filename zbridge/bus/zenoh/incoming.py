@@ -12,7 +12,6 @@ from collections.abc import Callable
 from typing import Any
 
 import zenoh
-import zenoh.ext
 
 from zbridge.bus.inbox import Inbox, Source
 from zbridge.bus.interface import Answer, PriorityClass, ReadPayload, Sample, Sort
@@ -84,12 +83,6 @@ def sorted_callback(sort: Sort, source: Source) -> Callable[[zenoh.Sample], None
             source.put(Sample(key, payload.to_bytes(), shown), priority, size)
 
     return store
-
-
-def subscribe_with_kept(session: zenoh.Session, key_expr: str, store: Any) -> Any:
-    """Subscribe to a key, and to the samples that advanced publishers keep, now and whenever one appears."""
-    history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
-    return zenoh.ext.declare_advanced_subscriber(session, key_expr, store, history=history)
 
 
 def query_callback(sort: Sort, source: Source, unanswered: Count) -> Callable[[zenoh.Query], None]:

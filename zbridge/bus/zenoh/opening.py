@@ -50,7 +50,10 @@ def zenoh_config(
     if settings.listen:
         values["listen/endpoints"] = settings.listen
     if bounds:
-        values["low_pass_filter"] = _size_filters(bounds)
+        values["low_pass_filter"] = [  # Zenoh drops input that is larger than its key allows
+            {"id": str(number), "flows": _INGRESS, "messages": _BOUNDED, "key_exprs": key_exprs, "size_limit": most}
+            for number, (key_exprs, most) in enumerate(bounds)
+        ]
     if settings.connect:
         values["connect/retry"] = _retry()
     if settings.effective_mode == "client":
@@ -75,14 +78,6 @@ def write_config(values: Mapping[str, Any]) -> zenoh.Config:
         except zenoh.ZError as error:
             raise BusError(f"{key} = {value!r}: {in_short(error)}") from error
     return config
-
-
-def _size_filters(bounds: SizeBounds) -> list[dict[str, Any]]:
-    """Make the filters by which Zenoh drops input that is larger than its key allows."""
-    return [
-        {"id": str(number), "flows": _INGRESS, "messages": _BOUNDED, "key_exprs": key_exprs, "size_limit": most_bytes}
-        for number, (key_exprs, most_bytes) in enumerate(bounds)
-    ]
 
 
 def _secure_values(tls: Tls) -> dict[str, Any]:

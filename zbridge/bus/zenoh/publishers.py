@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
-import msgspec
 import zenoh
 import zenoh.ext
 
 from zbridge.bus.interface import Batch, Publisher
-from zbridge.bus.writer import Writer
+from zbridge.bus.writer import Call, Writer
 from zbridge.bus.zenoh.declared import Declared, threadless
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.topics import Congestion, Delivery, Priority, QoS, Topic
@@ -54,88 +54,65 @@ class Publishers:
             if last is not None:
                 self._last_values.note(key, last)
             return _StatePublisher(self._session, key, options, self._states, self._last_values)
-        if qos.newest:
-            return _NewestPublisher(self._session, key, options, self._streams)
-        if topic.delivery is Delivery.STREAM:
+        if topic.delivery is Delivery.STREAM and not qos.newest:
             known = len(self.stream_keys) < STREAM_PUBLISHERS or key in self.stream_keys
             if known:
                 self.stream_keys.add(key)
             kind = _StreamPublisher if known else _StreamKey
             return kind(self._session, key, options, self._streams, blocks=self._lossless)
         plain = self._session.declare_publisher(key, express=qos.express, **options)
+        if qos.newest:  # large messages: of those that wait for the writer's thread only the newest is put
+            return WrittenPublisher(key, plain.put, partial(self._streams.newest, key), plain)
         blocks = qos.congestion is Congestion.BLOCK
-        return PlainPublisher(key, plain, self._states if blocks else None)
+        return WrittenPublisher(key, plain.put, self._states.put if blocks else _write, plain)
 
-    def put_all(self, batch: Batch) -> bool:
-        """Publish stream messages, those of a key in order; False asks to pause the source."""
-        return self._streams.put_at_once(partial(_put_batch, batch), sum(len(waiting) for _, waiting in batch))
+    def frames(self, key: str, listened: Callable[[bool], object], *, best_effort: bool, kept: int) -> Publisher:
+        """Declare a key of frames of any format; report when the first listener appears and the last one leaves.
 
-
-class PlainPublisher(Declared):
-    """Writes a key directly, or on a writer thread if a full queue blocks."""
-
-    def __init__(self, key: str, publisher: zenoh.Publisher, writer: Writer | None, *watches: Any) -> None:
-        """Begin. watches: what is undeclared with the publisher."""
-        super().__init__(*watches, publisher)
-        self.key = key
-        self.last: bytes | None = None
-        self._put = publisher.put
-        self._writer = writer
-
-    def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
-        if self._writer is not None:
-            return self._writer.put(lambda: self._put(payload, attachment=attachment))
-        self._put(payload, attachment=attachment)
-        return True
-
-
-class FramePublisher(Declared):
-    """Writes frames of any format on a key, and reports when the first listener appears and the last one leaves.
-
-    kept: last frames that late advanced subscribers get, and may query if one was lost. blocks: a congested bus delays
-    frames instead of dropping them.
-    """
-
-    def __init__(
-        self,
-        session: zenoh.Session,
-        key: str,
-        writer: Writer,
-        listened: Callable[[bool], None],
-        *,
-        best_effort: bool,
-        kept: int,
-        blocks: bool,
-    ) -> None:
-        congestion = _BLOCK if blocks else _DROP
-        self.key = key
-        self.last: bytes | None = None
-        self._writer = writer
+        kept: last frames that late advanced subscribers get, and may query if one was lost.
+        """
+        congestion = _BLOCK if self._lossless else _DROP
         reliability = zenoh.Reliability.BEST_EFFORT if best_effort else zenoh.Reliability.RELIABLE
-        plain: Any = session.declare_publisher(
+        plain: Any = self._session.declare_publisher(
             key, express=not best_effort, reliability=reliability, congestion_control=congestion
         )
         matching = plain.declare_matching_listener(threadless(lambda status: listened(status.matching)))
-        self._put: Callable[..., object] = plain.put
         publishers = [plain]
         if kept:
             advanced = zenoh.ext.declare_advanced_publisher(
-                session,
+                self._session,
                 key,
                 congestion_control=congestion,
                 cache=zenoh.ext.CacheConfig(kept),
                 publisher_detection=True,
                 sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=KEPT_TOLD_S),
             )
-            self._put = advanced.put
             publishers.append(advanced)
-        super().__init__(matching, *publishers)
+        write = partial(self._streams.put_at_once, size=1)
+        return WrittenPublisher(key, publishers[-1].put, write, matching, *publishers)
+
+    def put_all(self, batch: Batch) -> bool:
+        """Publish stream messages, those of a key in order; False asks to pause the source."""
+        return self._streams.put_at_once(partial(_put_batch, batch), sum(len(waiting) for _, waiting in batch))
+
+
+class WrittenPublisher(Declared):
+    """Writes a key by a call of Zenoh's that ``write`` makes: here, or on a thread of a writer if it may block."""
+
+    last: bytes | None = None
+
+    def __init__(self, key: str, put: Callable[..., object], write: Callable[[Call], bool], *entities: Any) -> None:
+        """Begin. entities: what is undeclared at the end."""
+        super().__init__(*entities)
+        self.key = key
+        self._put = put
+        self._write = write
 
     def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
-        return self._writer.put_at_once(partial(self._put, payload, attachment=attachment), 1)
+        return self._write(partial(self._put, payload, attachment=attachment))
 
 
-class _StreamPublisher(Declared):
+class _StreamPublisher(WrittenPublisher):
     """Writes a stream key, plain or express."""
 
     put_plain: Callable[..., object]
@@ -144,13 +121,12 @@ class _StreamPublisher(Declared):
     def __init__(
         self, session: zenoh.Session, key: str, options: dict[str, Any], writer: Writer, *, blocks: bool
     ) -> None:
-        self.key = key
-        self.last: bytes | None = None
         self._writer = writer
         self._blocks = blocks
         if blocks:
             options = {**options, "congestion_control": _BLOCK}
-        super().__init__(*self._declare(session, key, options))
+        entities = self._declare(session, key, options)
+        super().__init__(key, self.put_express, writer.put, *entities)
 
     def _declare(self, session: zenoh.Session, key: str, options: dict[str, Any]) -> tuple[Any, ...]:
         plain = session.declare_publisher(key, **options)
@@ -158,28 +134,11 @@ class _StreamPublisher(Declared):
         self.put_plain, self.put_express = plain.put, express.put
         return plain, express
 
-    def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
-        return self._writer.put(partial(self.put_express, payload, attachment=attachment))
-
     def close(self) -> None:
         if self._blocks:  # what waits is still written
             self._writer.put(super().close)
         else:
             super().close()
-
-
-class _NewestPublisher(Declared):
-    """Writes a stream of large messages, always on the writer's thread; of those waiting only the newest is put."""
-
-    def __init__(self, session: zenoh.Session, key: str, options: dict[str, Any], writer: Writer) -> None:
-        self.key = key
-        self.last: bytes | None = None
-        self._writer = writer
-        self._publisher = session.declare_publisher(key, **options)
-        super().__init__(self._publisher)
-
-    def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
-        return self._writer.newest(self.key, lambda: self._publisher.put(payload, attachment=attachment))
 
 
 class _StreamKey(_StreamPublisher):
@@ -189,13 +148,7 @@ class _StreamKey(_StreamPublisher):
         expression = session.declare_keyexpr(key)
         self.put_plain = partial(session.put, expression, **options)
         self.put_express = partial(session.put, expression, express=True, **options)
-        return (_Undeclared(lambda: session.undeclare(expression)),)
-
-
-class _Undeclared(msgspec.Struct):
-    """Something that a call undeclares."""
-
-    undeclare: Callable[[], object]
+        return (SimpleNamespace(undeclare=partial(session.undeclare, expression)),)
 
 
 class _LastValues:
@@ -277,6 +230,12 @@ def reply_and_drop(query: zenoh.Query, key: str, payload: bytes, attachment: byt
         query.reply(key, payload, attachment=attachment, express=True)
     finally:
         query.drop()  # type: ignore[no-untyped-call]
+
+
+def _write(call: Call) -> bool:
+    """Write here, on the caller's thread."""
+    call()
+    return True
 
 
 def _put_batch(batch: Batch) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import zenoh
+import zenoh.ext
 
 from zbridge.bus.inbox import Inbox
 from zbridge.bus.interface import Answer, BusSettings, Handle, IncomingQuery, PriorityClass, Publisher, Sample, Sort
@@ -30,12 +31,11 @@ from zbridge.bus.zenoh.incoming import (
     rate_limiting,
     read_change,
     read_reply,
-    subscribe_with_kept,
 )
-from zbridge.bus.zenoh.opening import in_short, open_or_explain, zenoh_config
-from zbridge.bus.zenoh.publishers import FramePublisher, Publishers
+from zbridge.bus.zenoh.opening import in_short, open_or_explain
+from zbridge.bus.zenoh.publishers import Publishers
 from zbridge.errors import BusError
-from zbridge.fleet.topics import SizeBounds, Topic
+from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
 
 H = TypeVar("H", bound=Handle)
@@ -49,28 +49,22 @@ _TIDY = 64
 
 
 async def open_zenoh(
+    config: zenoh.Config,
     settings: BusSettings,
     metrics: Metrics,
     *,
-    wait_for_peers: bool = False,
-    bounds: SizeBounds = (),
-    within_s: float = 1.0,
-    realm: str | None = None,
-    robot: str | None = None,
-    timestamps: bool = False,
-    explain: bool = True,
-    threads: bool = True,
+    realm: str | None,
+    robot: str | None,
+    explain: bool,
+    threads: bool,
 ) -> ZenohBus:
-    """Open a Zenoh session; raise BusError if that is not possible (a client: no router within ``within_s``)."""
-    config = zenoh_config(
-        settings, wait_for_peers=wait_for_peers, bounds=bounds, within_s=within_s, timestamps=timestamps
-    )
+    """Open a session of this configuration for :func:`zbridge.bus.open_bus`."""
     session = await open_or_explain(config, settings, explain=explain)
     bus = ZenohBus(session, asyncio.get_running_loop(), metrics, stream=settings.stream, threads=threads)
     certificate = own_certificate(settings.tls)
     if certificate is not None and realm is not None:
         try:
-            await require_member(bus.ask, [str(zid) for zid in session.info.routers_zid()], certificate, realm, robot)
+            await require_member(bus.ask, bus.routers(), certificate, realm, robot)
         except BaseException:
             await bus.close()
             raise
@@ -95,7 +89,7 @@ class ZenohBus:
         self._threads = threads
         self._loop = loop
         self._stream = stream
-        self._lossless = lossless = stream == "block"
+        lossless = stream == "block"
         self._shares = beside is not None
         self._inbox = Inbox(loop, metrics)
         self._inboxes: list[Inbox] = beside._inboxes if beside is not None else []
@@ -147,8 +141,10 @@ class ZenohBus:
         store: Any = direct_callback(key_expr, handler) if direct else loop_callback(self._inbox, handler, priority)
         if direct or not self._threads:
             store = prompt(store)
-        if kept:
-            return self._keep(Declared(subscribe_with_kept(self._session, key_expr, store)))
+        if kept:  # what advanced publishers keep, too, now and whenever one appears
+            kept_ones = zenoh.ext.HistoryConfig(detect_late_publishers=True)
+            advanced = zenoh.ext.declare_advanced_subscriber(self._session, key_expr, store, history=kept_ones)
+            return self._keep(Declared(advanced))
         return self._keep(Declared(self._session.declare_subscriber(key_expr, store)))
 
     def answer(
@@ -212,45 +208,29 @@ class ZenohBus:
         return Declared(watch)
 
     async def flush(self) -> None:
-        """Wait until all queued states and answers are handed to Zenoh; raise BusError after :data:`FLUSH_S`."""
         await self._flush(self._writer)
 
     async def drain(self, key_expr: str) -> None:
-        """Wait until all that was published has left: a query of the lowest priority follows it."""
         await self._flush(self._streams)
         options: Any = {"priority": zenoh.Priority.BACKGROUND, "congestion_control": zenoh.CongestionControl.BLOCK}
         await self._collect(key_expr, lambda handler: self._session.get(key_expr, handler, timeout=1.0, **options), 1.0)
 
     async def _flush(self, writer: Writer) -> None:
-        loop = self._loop
-        written: asyncio.Future[None] = loop.create_future()
-
-        def tell() -> None:
-            if not written.done():
-                written.set_result(None)
-
-        def ring() -> None:
-            loop.call_soon_threadsafe(tell)
-
-        writer.put(ring)
+        written = asyncio.Event()
+        writer.put(lambda: self._loop.call_soon_threadsafe(written.set))
         try:
             async with asyncio.timeout(FLUSH_S):
-                await written
+                await written.wait()
         except TimeoutError:
             raise BusError(f"the bus accepted nothing for {FLUSH_S:g} s") from None
 
     def frames(
         self, key: str, listened: Callable[[bool], None], *, best_effort: bool = False, kept: int = 0
     ) -> Publisher:
-
         def changed(matching: bool) -> None:
             self._loop.call_soon_threadsafe(listened, matching)
 
-        return self._keep(
-            FramePublisher(
-                self._session, key, self._streams, changed, best_effort=best_effort, kept=kept, blocks=self._lossless
-            )
-        )
+        return self._keep(self._publishers.frames(key, changed, best_effort=best_effort, kept=kept))
 
     def watch_listeners(self, key: str, handler: Callable[[bool], None]) -> Handle:
         return self.frames(key, handler)
@@ -299,19 +279,13 @@ class ZenohBus:
 
     async def _collect(self, key_expr: str, start: Callable[[Any], Any], timeout_s: float) -> list[Any]:
         """Run a get and collect its replies. Zenoh drops the handler after the last reply, which ends the wait."""
-        loop, replies = self._loop, Replies(key_expr, self._replies_dropped)
-        done = loop.create_future()
-
-        def finish() -> None:
-            if not done.done():
-                done.set_result(None)
-
-        handler = zenoh.handlers.Callback(replies.take, lambda: loop.call_soon_threadsafe(finish))
+        replies, done = Replies(key_expr, self._replies_dropped), asyncio.Event()
+        handler = zenoh.handlers.Callback(replies.take, lambda: self._loop.call_soon_threadsafe(done.set))
         try:
             await asyncio.to_thread(start, handler)
         except zenoh.ZError as error:
             raise BusError(in_short(error)) from error
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout_s + 0.5):  # wait_for of Python 3.11 may lose a cancellation
-                await done
+                await done.wait()
         return list(replies)

@@ -24,7 +24,7 @@ from zbridge.fleet.messages import (
 )
 from zbridge.fleet.payload import measured_ns
 from zbridge.metrics import Metrics
-from zbridge.protocol.odometry import Odometry
+from zbridge.protocol.kinematics import Odometry
 from zbridge.ros2.rmw_zenoh import KEEP_LAST_10, LATCHED, SENSOR_DATA, RosQoS, ros_name
 from zbridge.ros2.types import Types
 from zbridge.views.ros2.diagnostics import Diagnostic, entries_of

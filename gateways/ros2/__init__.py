@@ -1,9 +1,8 @@
 """ROS 2 robots whose nodes use rmw_zenoh: read and driven over plain Zenoh, without ROS.
 
 ``messages`` declares the messages; ``graph`` knows who publishes and who subscribes to commands; ``session`` holds the
-conversation;
-``translate`` is the device side, ``options`` its options. ``simulator`` is a simulated robot. HQ programs of other
-protocols drive it; it has no HQ side of its own: what ROS users see is ``zbridge ros2``.
+conversation; ``translate`` is the device side, ``options`` its options. ``simulator`` is a simulated robot. HQ programs
+of other protocols drive it; it has no HQ side of its own: what ROS users see is ``zbridge ros2``.
 """
 
 from __future__ import annotations

@@ -7,7 +7,8 @@ import msgspec
 from gateways.ros2.messages import RECEIVED, TRANSIENT_LOCAL, TWIST, TWIST_STAMPED, Received, TwistCommand
 from gateways.ros2.options import RosOptions
 from zbridge.protocol import ProtocolError
-from zbridge.ros2 import NO_HASH, Endpoint, Kind, Types, endpoints_of, read_token
+from zbridge.ros2.rmw_zenoh import Endpoint, Kind, endpoints_of, read_token
+from zbridge.ros2.types import NO_HASH, Types
 
 ENDPOINTS = 64
 """Most known publishers of the robot, subscribers to its commands, and other drivers, each; the rest is ignored."""
@@ -29,11 +30,10 @@ class Graph:
         self._domain = options.domain
         self._types = types
         self.command_topic = options.topic("cmd_vel")
-        topics = ((option, options.topic(option)) for option in RECEIVED)
         self._wanted = {
-            name: Wanted(name, RECEIVED[option][0], (RECEIVED[option][1],), option in TRANSIENT_LOCAL)
-            for option, name in topics
-            if name is not None
+            name: Wanted(name, received, (type_name,), option in TRANSIENT_LOCAL)
+            for option, (received, type_name) in RECEIVED.items()
+            if (name := options.topic(option)) is not None
         }
         self._command = Wanted(self.command_topic or "", TwistCommand, (TWIST, TWIST_STAMPED), latched=False)
         self.own_zid: str | None = None
@@ -56,12 +56,10 @@ class Graph:
 
     def watched(self) -> list[str]:
         """List the expressions of the tokens that matter."""
-        watched = [endpoints_of(self._domain, Kind.PUBLISHER, name) for name in self._wanted]
+        watched = [(Kind.PUBLISHER, name) for name in self._wanted]
         if self.command_topic is not None:
-            watched += [
-                endpoints_of(self._domain, kind, self.command_topic) for kind in (Kind.SUBSCRIBER, Kind.PUBLISHER)
-            ]
-        return watched
+            watched += [(Kind.SUBSCRIBER, self.command_topic), (Kind.PUBLISHER, self.command_topic)]
+        return [endpoints_of(self._domain, kind, name) for kind, name in watched]
 
     def appeared(self, token: str) -> Endpoint:
         """Enter an endpoint; raise ProtocolError for one that is not of this robot, or not as it should be."""
@@ -93,8 +91,7 @@ class Graph:
         if self.wrong.pop(token, None) is not None:
             return True
         for table in (self.publishers, self.subscribers, self.drivers):
-            endpoint = table.pop(token, None)
-            if endpoint is not None:
+            if (endpoint := table.pop(token, None)) is not None:
                 for gid in endpoint.gids():
                     self.gids.pop(gid, None)
                 return True

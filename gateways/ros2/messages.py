@@ -10,14 +10,14 @@ from typing import Any
 import msgspec
 
 from zbridge.protocol import KeyedSample
-from zbridge.ros2 import Types
+from zbridge.ros2.types import Types
 
 TWIST, TWIST_STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 _NS_PER_S = 1_000_000_000
 
 
 class LinkEvent(msgspec.Struct, frozen=True):
-    """News of the link: it is open, a token appeared or is gone, samples were dropped."""
+    """News of the link: it is open, a token appeared or is gone, samples were dropped, one of our own came back."""
 
     sample: KeyedSample
 
@@ -62,10 +62,6 @@ class TwistCommand(Received, frozen=True):
     """What another node wrote to the topic of commands: geometry_msgs/msg/Twist or TwistStamped."""
 
 
-class Ignored(msgspec.Struct, frozen=True):
-    """A sample of our own that came back."""
-
-
 RECEIVED: dict[str, tuple[type[Received], str]] = {
     "scan": (LaserScan, "sensor_msgs/msg/LaserScan"),
     "odom": (Odometry, "nav_msgs/msg/Odometry"),
@@ -94,10 +90,7 @@ STOPPED = Velocity()
 
 def write_twist(types: Types, type_name: str, velocity: Velocity) -> bytes:
     """Write a velocity as CDR of one of the two types; the stamp of a TwistStamped is zero."""
-    linear = types.message("geometry_msgs/msg/Vector3", x=velocity.forward, y=velocity.left)
-    angular = types.message("geometry_msgs/msg/Vector3", z=velocity.turn)
-    twist = types.message(TWIST, linear=linear, angular=angular)
+    twist = {"linear": {"x": velocity.forward, "y": velocity.left}, "angular": {"z": velocity.turn}}
     if type_name == TWIST_STAMPED:
-        header = types.message("std_msgs/msg/Header", frame_id="base_link")
-        twist = types.message(TWIST_STAMPED, header=header, twist=twist)
-    return types.encode(twist)
+        return types.encode(types.message(TWIST_STAMPED, header={"frame_id": "base_link"}, twist=twist))
+    return types.encode(types.message(TWIST, **twist))

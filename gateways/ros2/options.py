@@ -6,11 +6,10 @@ from typing import Annotated
 
 import msgspec
 
+from gateways.ros2.messages import RECEIVED
 from zbridge.protocol import ConfigError, Positive
-from zbridge.ros2 import DISTROS, is_ros_name
-
-TOPICS = ("scan", "odom", "map", "imu", "battery_state", "image")
-"""The options that name topics which the robot publishes."""
+from zbridge.ros2.rmw_zenoh import is_ros_name
+from zbridge.ros2.types import DISTROS
 
 
 class RosOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -40,14 +39,14 @@ class RosOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ConfigError(f"distro = {self.distro!r}: expected one of {', '.join(DISTROS)}")
         if self.namespace.strip("/") and not is_ros_name(self.full_namespace):
             raise ConfigError(f"namespace = {self.namespace!r}: expected a name like '/r1'")
-        names = {option: self.topic(option) for option in (*TOPICS, "cmd_vel")}
+        names = {option: self.topic(option) for option in (*RECEIVED, "cmd_vel")}
         for option, name in names.items():
             if name is not None and not is_ros_name(name):
                 raise ConfigError(f"{option} = {getattr(self, option)!r}: expected a name like {option!r}")
         used = [name for name in names.values() if name is not None]
         if len(set(used)) < len(used):
             raise ConfigError(f"{', '.join(used)}: expected a topic of its own for each")
-        if not any(names[option] for option in TOPICS):
+        if not any(names[option] for option in RECEIVED):
             raise ConfigError("scan, odom ...: expected at least one topic, which shows that the robot is there")
 
     @property

@@ -16,7 +16,7 @@ import struct
 from typing import Any
 
 from gateways.ros2.graph import Graph
-from gateways.ros2.messages import LIVE, STOPPED, TWIST_STAMPED, Ignored, LinkEvent, TwistCommand, Velocity, write_twist
+from gateways.ros2.messages import LIVE, STOPPED, TWIST_STAMPED, LinkEvent, TwistCommand, Velocity, write_twist
 from gateways.ros2.options import RosOptions
 from zbridge.protocol import (
     SAMPLE_BYTES,
@@ -36,7 +36,8 @@ from zbridge.protocol import (
     subscription,
     write_sample,
 )
-from zbridge.ros2 import KEEP_LAST_10, LATCHED, SENSOR_DATA, Attachment, Endpoint, Kind, Node, Types, read_attachment
+from zbridge.ros2.rmw_zenoh import KEEP_LAST_10, LATCHED, SENSOR_DATA, Attachment, Endpoint, Kind, Node, read_attachment
+from zbridge.ros2.types import Types
 
 HANDSHAKE_S = 60.0
 """Seconds after which the link is opened anew where nothing of the robot was received."""
@@ -64,7 +65,7 @@ class RosRole(Session[Any]):
 
     role = Role.HQ
     frame_end = staticmethod(sample_end)
-    handled = frozenset({LinkEvent, TwistCommand, Ignored})
+    handled = frozenset({LinkEvent, TwistCommand})
 
     def __init__(self, options: RosOptions, types: Types, overruled: Count) -> None:
         super().__init__(Limits(frame_bytes=SAMPLE_BYTES, handshake_s=HANDSHAKE_S))
@@ -112,7 +113,7 @@ class RosRole(Session[Any]):
         wanted, type_name = found
         gid = read_attachment(sample.attachment).gid
         if gid == self._gids.get(sample.key):
-            return Ignored()
+            return LinkEvent(sample)
         if gid not in self.graph.gids and wanted.received is not TwistCommand:  # robots obey whoever writes
             raise ProtocolError(f"{wanted.name}: from no publisher that has a token")
         message = wanted.received(self._types.decode(type_name, sample.payload))
@@ -131,8 +132,6 @@ class RosRole(Session[Any]):
             return False
         if isinstance(message, TwistCommand):
             self._overrule(now)
-            return False
-        if isinstance(message, Ignored):
             return False
         if self.state is State.HANDSHAKING:
             self.establish("", self.graph.features)
@@ -275,9 +274,7 @@ class RosRole(Session[Any]):
         if self.state is not State.ESTABLISHED or self._options.shared or not self._answers.take(now):
             return
         self._overruled.value += 1
-        until = None if self.moving else now
-        if self.outbox.is_set(_DRIVE):  # zeros of a stop are not cut short
-            until = None
+        until = None if self.moving or self.outbox.is_set(_DRIVE) else now  # zeros of a stop are not cut short
         if self.graph.subscribers:
             self.drive(self._velocity, now, until=until, urgent=not self.moving)
 
@@ -311,11 +308,9 @@ class RosRole(Session[Any]):
 
 def _robot_stamp(robot_time: tuple[int, float] | None, now: float) -> bytes:
     """Write the time on the robot's clock, be it simulated or wrong: controllers drop what is old there."""
-    if robot_time is None:
-        return _STAMP.pack(0, 0)
-    stamp_ns, received_at = robot_time
+    stamp_ns, received_at = robot_time or (0, now)
     seconds, ns = divmod(stamp_ns + round((now - received_at) * _NS_PER_S), _NS_PER_S)
-    return _STAMP.pack(seconds, ns) if 0 <= seconds < 2**31 else _STAMP.pack(0, 0)
+    return _STAMP.pack(seconds, ns) if 0 <= seconds < 2**31 else bytes(_STAMP.size)
 
 
 class _Dated(Outbox):

@@ -7,7 +7,6 @@ when no command came for :data:`TIMEOUT_S`.
 from __future__ import annotations
 
 import asyncio
-import logging
 import math
 import random
 import socket
@@ -35,25 +34,12 @@ from zbridge.protocol import (
     subscription,
     write_sample,
 )
-from zbridge.ros2 import (
-    DISTROS,
-    KEEP_LAST_10,
-    LATCHED,
-    SENSOR_DATA,
-    Attachment,
-    Endpoint,
-    Kind,
-    Node,
-    Types,
-    read_attachment,
-    types_of,
-)
+from zbridge.ros2.rmw_zenoh import KEEP_LAST_10, LATCHED, SENSOR_DATA, Attachment, Endpoint, Kind, Node, read_attachment
+from zbridge.ros2.types import DISTROS, Types, types_of
 from zbridge.simulation.simulator import STEP_S, live
 from zbridge.simulation.world import Body, Grid, cast
 from zbridge.transport import Conversation, ConversationHooks
 from zbridge.transport.samples import serve
-
-log = logging.getLogger("gateways.ros2.simulator")
 
 TIMEOUT_S = 0.5
 """Seconds after which a command counts no more (``cmd_vel_timeout`` of ros2_controllers)."""
@@ -116,11 +102,8 @@ class NodeRole(Session[Any]):
                 node, number, Kind.PUBLISHER, f"{prefix}/{name}", type_name, types.hash(type_name), qos
             )
         self.send_first(subscription(subscriber.key))
-        for token in (
-            node.token(),
-            subscriber.token(),
-            *(publisher.token() for publisher in self._publishers.values()),
-        ):
+        endpoints = (subscriber, *self._publishers.values())
+        for token in (node.token(), *(endpoint.token() for endpoint in endpoints)):
             self.send_first(KeyedSample(SampleKind.ANNOUNCE, token))
 
     def publish(self, name: str, message: Any) -> None:
@@ -178,33 +161,22 @@ class RosMachine:
         )
 
     def odometry(self, header: Any) -> Any:
-        make, body = self._types.message, self.body
-        pose = make(
-            "geometry_msgs/msg/Pose",
-            position=make("geometry_msgs/msg/Point", x=body.x, y=body.y),
-            orientation=self._heading(),
-        )
-        twist = make(
-            "geometry_msgs/msg/Twist",
-            linear=make("geometry_msgs/msg/Vector3", x=self.forward),
-            angular=make("geometry_msgs/msg/Vector3", z=self.turn),
-        )
-        return make(
+        position = {"x": self.body.x, "y": self.body.y}
+        return self._types.message(
             "nav_msgs/msg/Odometry",
             header=header,
             child_frame_id="base_link",
-            pose=make("geometry_msgs/msg/PoseWithCovariance", pose=pose),
-            twist=make("geometry_msgs/msg/TwistWithCovariance", twist=twist),
+            pose={"pose": {"position": position, "orientation": self._heading()}},
+            twist={"twist": {"linear": {"x": self.forward}, "angular": {"z": self.turn}}},
         )
 
     def imu(self, header: Any) -> Any:
-        make = self._types.message
-        return make(
+        return self._types.message(
             "sensor_msgs/msg/Imu",
             header=header,
             orientation=self._heading(),
-            angular_velocity=make("geometry_msgs/msg/Vector3", z=self.turn),
-            linear_acceleration=make("geometry_msgs/msg/Vector3", z=9.80665),
+            angular_velocity={"z": self.turn},
+            linear_acceleration={"z": 9.80665},
         )
 
     def battery(self, header: Any) -> Any:
@@ -216,22 +188,15 @@ class RosMachine:
 
     def map(self, header: Any) -> Any:
         """Return the map of what was seen so far."""
-        make = self._types.message
-        percents = np.array([-1, 0, 100], np.int8)[self.grid.cells.T]
-        corner = make("geometry_msgs/msg/Point", x=-CELLS * CELL_M / 2, y=-CELLS * CELL_M / 2)
-        level = make("geometry_msgs/msg/Quaternion", w=1.0)
-        info = make(
-            "nav_msgs/msg/MapMetaData",
-            resolution=CELL_M,
-            width=CELLS,
-            height=CELLS,
-            origin=make("geometry_msgs/msg/Pose", position=corner, orientation=level),
-        )
-        return make("nav_msgs/msg/OccupancyGrid", header=header, info=info, data=percents.reshape(-1))
+        percents = np.array([-1, 0, 100], np.int8)[self.grid.cells.T].reshape(-1)
+        corner = {"x": -CELLS * CELL_M / 2, "y": -CELLS * CELL_M / 2}
+        origin = {"position": corner, "orientation": {"w": 1.0}}
+        info = {"resolution": CELL_M, "width": CELLS, "height": CELLS, "origin": origin}
+        return self._types.message("nav_msgs/msg/OccupancyGrid", header=header, info=info, data=percents)
 
-    def _heading(self) -> Any:
+    def _heading(self) -> dict[str, float]:
         half = self.body.heading / 2
-        return self._types.message("geometry_msgs/msg/Quaternion", z=math.sin(half), w=math.cos(half))
+        return {"z": math.sin(half), "w": math.cos(half)}
 
 
 _SENT = {
@@ -265,7 +230,7 @@ async def simulate(simulation: Simulation) -> None:
     async with serve(address, conversation):
         simulation.ready((address,))
         try:
-            await live(partial(_step, machine, session, conversation, types))
+            await live(partial(_step, machine, session, conversation))
         finally:
             conversation.close("simulator ended")
 
@@ -278,15 +243,14 @@ def _with_port(address: Address) -> Address:
         return Address(address.host, int(free.getsockname()[1]))
 
 
-def _step(machine: RosMachine, session: NodeRole, conversation: Conversation, types: Types, steps: int) -> None:
+def _step(machine: RosMachine, session: NodeRole, conversation: Conversation, steps: int) -> None:
     machine.step(STEP_S)
     if session.state is not State.ESTABLISHED:
         return
     seconds, nanoseconds = divmod(time.time_ns(), _NS_PER_S)
-    stamp = types.message("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
     for name, (measure, frame, every) in _SENT.items():
         if steps % every == 0:
-            header = types.message("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+            header = {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": frame}
             session.publish(name, measure(machine, header))
     conversation.pump()
 

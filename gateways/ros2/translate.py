@@ -38,9 +38,8 @@ from zbridge.protocol import (
     Translate,
     Unsupported,
 )
-from zbridge.ros2 import types_of
+from zbridge.ros2.types import types_of
 
-NAME = "ros2"
 OLDEST_NS = 1_000_000_000
 """A stamp is believed if it is at most this much before its arrival."""
 AHEAD_NS = 100_000_000
@@ -69,7 +68,8 @@ class RosRobot(RobotSide):
         self.options = options
         self._types = types_of(options.distro)
         self.dialect = options.distro  # type: ignore[misc]
-        self._scanner: Scanner | None = None
+        self._geometry: tuple[float, ...] = ()
+        """Of the last scanner that was shown."""
         self._known: dict[str, FleetMessage] = {}
         self._speed: float | None = None
         self._has_imu = False
@@ -79,7 +79,7 @@ class RosRobot(RobotSide):
 
     def session(self, link: str, peer: str) -> RosRole:
         self.driving = RosRole(self.options, self._types, self._overruled)
-        self._scanner, self._speed, self._has_imu = None, None, False
+        self._geometry, self._speed, self._has_imu = (), None, False
         self._known.clear()
         return self.driving
 
@@ -105,16 +105,11 @@ class RosRobot(RobotSide):
         stamp, device_ms = self._stamps(message, stamp_ns)
         scan = Scan(first, increment, low, high, ranges, stamp_ns=stamp, device_ms=device_ms)
         geometry = (first, first + increment * (count - 1), increment, float(body.time_increment), low, high, count)
-        if self._scanner is not None and self._scanner_fields(self._scanner) == geometry:
+        if self._geometry == geometry:
             return ((topics.SCAN, scan),)
         _require(math.isfinite(geometry[3]), "scan with a time increment that is no number")
-        self._scanner = Scanner(*geometry, stamp_ns=stamp)
-        return ((topics.SCANNER, self._scanner), (topics.SCAN, scan))
-
-    @staticmethod
-    def _scanner_fields(scanner: Scanner) -> tuple[float, ...]:
-        angles = (scanner.angle_min, scanner.angle_max, scanner.angle_increment, scanner.time_increment_s)
-        return (*angles, scanner.range_min, scanner.range_max, scanner.points)
+        self._geometry = geometry
+        return ((topics.SCANNER, Scanner(*geometry, stamp_ns=stamp)), (topics.SCAN, scan))
 
     def _odometry(self, message: Odometry, stamp_ns: int) -> tuple[Telemetry, ...]:
         at, q = message.body.pose.pose.position, message.body.pose.pose.orientation

@@ -10,12 +10,11 @@ import pytest
 
 from tests.camera.camera_bytes import HEAD, jpeg, part
 from tests.fake_bus import FakeBus
-from zbridge.camera import CameraSettings, plan_camera
 from zbridge.camera import camera as cameras
 from zbridge.camera.camera import RETRY_S, Camera
 from zbridge.camera.demand import LINGER_S
 from zbridge.camera.mjpeg import MjpegPart, MjpegReader
-from zbridge.camera.settings import CameraSource
+from zbridge.camera.settings import CameraSettings, CameraSource, plan_camera
 from zbridge.camera.upstream import OnParts
 from zbridge.control.context import Conditions
 from zbridge.errors import LinkError

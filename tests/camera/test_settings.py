@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from zbridge.camera import CameraSettings, plan_camera
-from zbridge.camera.settings import CameraSource
+from zbridge.camera.settings import CameraSettings, CameraSource, plan_camera
 from zbridge.errors import ConfigError
 from zbridge.protocol.address import Address
 

@@ -22,8 +22,8 @@ from zbridge.lease.proof import Verifier, read
 from zbridge.protocol.address import Address, parse_device_address
 from zbridge.protocol.samples import KeyedSample, SampleKind, read_sample, write_sample
 from zbridge.robot import claim
-from zbridge.ros2 import Attachment, read_attachment, types_of
-from zbridge.ros2.rmw_zenoh import read_token
+from zbridge.ros2.rmw_zenoh import Attachment, read_attachment, read_token
+from zbridge.ros2.types import types_of
 from zbridge.views.foxglove import requests
 from zbridge.views.foxglove.requests import Scale
 from zbridge.views.foxglove.requests import read_twist as read_json_twist

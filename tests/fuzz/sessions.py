@@ -203,7 +203,7 @@ def _samples() -> list[bytes]:
     """Write what the link of a ROS 2 robot brings: the link opens, a publisher appears, odometry comes."""
     from tests.gateways.ros2 import scene
     from zbridge.protocol import KeyedSample, SampleKind, write_sample
-    from zbridge.ros2 import gid_of
+    from zbridge.ros2.rmw_zenoh import gid_of
 
     made = []
     for number, (topic, kind) in enumerate(scene.KINDS.items()):

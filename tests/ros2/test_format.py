@@ -7,27 +7,26 @@ import struct
 import pytest
 
 from zbridge.errors import ProtocolError
-from zbridge.ros2 import (
+from zbridge.ros2.rmw_zenoh import (
     KEEP_LAST_10,
     LATCHED,
     SENSOR_DATA,
     Attachment,
-    Durability,
     Endpoint,
     Kind,
     Node,
-    Reliability,
     RosQoS,
-    all_tokens,
     dds_type,
     endpoints_of,
+    gid_of,
     is_ros_name,
+    read_attachment,
+    read_qos,
     read_token,
     ros_name,
     ros_type,
     topic_key,
 )
-from zbridge.ros2.rmw_zenoh import gid_of, read_attachment, read_qos
 
 STRING = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 ADD = "RIHS01_e118de6bf5eeb66a2491b5bda11202e7b68f198d6f67922cf30364858239c81a"
@@ -83,7 +82,7 @@ QOS = {
     ":1:,1:,:,:,,": LATCHED,
     "2::,5:,:,:,,": SENSOR_DATA,
     "::,:,:,:,,": RosQoS(depth=42),
-    "2:1:2,:,:,:,,": RosQoS(Reliability.BEST_EFFORT, Durability.TRANSIENT_LOCAL, 0),
+    "2:1:2,:,:,:,,": RosQoS(best_effort=True, transient_local=True, depth=0),
 }
 NAMES = {"r1": "r1", "front left": "front_left", "7": "_7", "": "_", "a-b.c": "a_b_c", "Ä": "_"}
 
@@ -179,16 +178,11 @@ def test_tokens_of_a_topic_are_asked_for_by_its_name() -> None:
     assert endpoints_of(3, Kind.PUBLISHER, "/r1/scan") == "@ros2_lv/3/*/*/*/MP/*/*/*/%r1%scan/*/*/*"
 
 
-def test_all_tokens_of_a_domain_or_of_a_kind_are_asked_for() -> None:
-    assert all_tokens(3) == "@ros2_lv/3/**"
-    assert endpoints_of(3, Kind.SERVER) == "@ros2_lv/3/*/*/*/SS/*/*/*/*/*/*/*"
-
-
 FOREIGN_QOS = {  # other numbers of rmw's policies, as rmw_zenoh may write them
     "1:2:1,7:,:,:,,": RosQoS(depth=7),
     "0:0:0,:,:,:,,": RosQoS(depth=42),
     "3:3:3,1:,:,:,,": RosQoS(depth=1),
-    "2:1:2,9:,:,:,,": RosQoS(Reliability.BEST_EFFORT, Durability.TRANSIENT_LOCAL, 0),
+    "2:1:2,9:,:,:,,": RosQoS(best_effort=True, transient_local=True, depth=0),
     "::,10:,:,:,,:more": KEEP_LAST_10,
     "4::,10:,:,:,,": None,
     ":4:,10:,:,:,,": None,

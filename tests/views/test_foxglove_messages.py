@@ -69,7 +69,7 @@ def test_a_pose_turns_counter_clockwise_about_the_vertical() -> None:
 
 
 def test_frames_lead_from_parent_to_child() -> None:
-    placed = (("r1/map", "r1/base", Pose(1.0, 2.0, math.pi)), ("r1/base", "r1/scan", None))
+    placed = (("r1/map", "r1/base", Pose(1.0, 2.0, math.pi)), ("r1/base", "r1/scan", Pose(0.0, 0.0, 0.0)))
     fields = read(foxglove_schema("FrameTransforms"), pictures.transforms(placed, STAMP_NS))
     base, scanner = fields["transforms"]
     assert (base["parent_frame_id"], base["child_frame_id"], base["timestamp"]) == ("r1/map", "r1/base", STAMP)

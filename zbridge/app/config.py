@@ -18,7 +18,7 @@ import msgspec
 
 from zbridge.bus import BusSettings
 from zbridge.bus.tls.files import TLS_VARIABLE, folder_settings, tls_beside
-from zbridge.camera import CameraPlan, CameraSettings, plan_camera
+from zbridge.camera.settings import CameraPlan, CameraSettings, plan_camera
 from zbridge.control.settings import ControlSettings
 from zbridge.errors import ConfigError, LinkError
 from zbridge.fleet.topics import is_name

@@ -4,7 +4,3 @@
 imported only if a configuration names a camera. Knows no protocol: a camera is a separate device beside the robot's
 links.
 """
-
-from zbridge.camera.settings import CameraPlan, CameraSettings, plan_camera
-
-__all__ = ["CameraPlan", "CameraSettings", "plan_camera"]

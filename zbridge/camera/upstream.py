@@ -31,15 +31,16 @@ async def fetch(source: CameraSource, stall_s: float, on_parts: OnParts) -> None
     A stream without a whole picture for ``stall_s`` seconds is ended. One that sends more than a camera does is read
     more slowly (:class:`ReadBudget`).
     """
-    reader, writer = await _connect(source)
     try:
-        lines = (f"GET {source.target} HTTP/1.0", f"Host: {source.authority}", "User-Agent: zbridge", "", "")
-        writer.write("\r\n".join(lines).encode("ascii"))
-        await _read(reader, stall_s, on_parts)
+        reader, writer = await _connect(source)
+        try:
+            lines = (f"GET {source.target} HTTP/1.0", f"Host: {source.authority}", "User-Agent: zbridge", "", "")
+            writer.write("\r\n".join(lines).encode("ascii"))
+            await _read(reader, stall_s, on_parts)
+        finally:
+            writer.transport.abort()
     except OSError as error:
         raise LinkError(explain(error)) from error
-    finally:
-        writer.transport.abort()
 
 
 def explain(error: OSError) -> str:
@@ -54,8 +55,6 @@ async def _connect(source: CameraSource) -> tuple[asyncio.StreamReader, asyncio.
             return await asyncio.open_connection(source.host, source.port)
     except TimeoutError:
         raise LinkError(f"no connection within {CONNECT_S:g} s") from None
-    except OSError as error:
-        raise LinkError(explain(error)) from error
 
 
 async def _read(reader: asyncio.StreamReader, stall_s: float, on_parts: OnParts) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import struct
-from enum import Enum, IntEnum
+from enum import Enum
 
 import msgspec
 
@@ -60,34 +60,19 @@ _DEFAULT_DEPTH = 42
 """rmw_zenoh's default, which it leaves out."""
 
 
-class Reliability(IntEnum):
-    """rmw_qos_reliability_policy_e."""
-
-    RELIABLE = 1
-    BEST_EFFORT = 2
-
-
-class Durability(IntEnum):
-    """rmw_qos_durability_policy_e."""
-
-    TRANSIENT_LOCAL = 1
-    VOLATILE = 2
-
-
 class RosQoS(msgspec.Struct, frozen=True):
     """How an endpoint sends or wants messages. depth: kept messages; 0: all of them.
 
-    Deadline, lifespan and liveliness are always the defaults.
+    best_effort: not reliable. transient_local: not volatile. Deadline, lifespan and liveliness are always the defaults.
     """
 
-    reliability: Reliability = Reliability.RELIABLE
-    durability: Durability = Durability.VOLATILE
+    best_effort: bool = False
+    transient_local: bool = False
     depth: int = 10
 
     def __str__(self) -> str:
         """Write it as in tokens: a field that has rmw_zenoh's default is empty."""
-        reliability = "" if self.reliability is Reliability.RELIABLE else str(int(self.reliability))
-        durability = "" if self.durability is Durability.VOLATILE else str(int(self.durability))
+        reliability, durability = "2" if self.best_effort else "", "1" if self.transient_local else ""
         history = "" if self.depth else "2"
         depth = str(self.depth) if self.depth and self.depth != _DEFAULT_DEPTH else ""
         return f"{reliability}:{durability}:{history},{depth}:,:,:,,"
@@ -95,27 +80,19 @@ class RosQoS(msgspec.Struct, frozen=True):
 
 def read_qos(text: str) -> RosQoS | None:
     """Read the quality of service of a token; None if it is none. Only the first three fields are looked at."""
-    parts = text.split(":")
-    if len(parts) < 6:
+    found = _QOS.fullmatch(text)
+    if found is None:
         return None
-    history, comma, depth = parts[2].partition(",")
-    if not comma:
-        return None
-    if any(policy not in _POLICIES for policy in (parts[0], parts[1], history)):
-        return None
-    reliability = Reliability.BEST_EFFORT if parts[0] == "2" else Reliability.RELIABLE
-    durability = Durability.TRANSIENT_LOCAL if parts[1] == "1" else Durability.VOLATILE
-    if depth and not (depth.isascii() and depth.isdigit() and len(depth) < 19):
-        return None
-    return RosQoS(reliability, durability, 0 if history == "2" else int(depth or _DEFAULT_DEPTH))
+    reliability, durability, history, depth = found.groups()
+    return RosQoS(reliability == "2", durability == "1", 0 if history == "2" else int(depth or _DEFAULT_DEPTH))
 
 
-_POLICIES = ("", "0", "1", "2", "3")
-"""The policies that rmw knows, by number; empty: its default."""
+_QOS = re.compile(r"([0-3]?):([0-3]?):([0-3]?),([0-9]{0,18})(?::[^:]*){3,}")
+"""Reliability, durability and history as rmw numbers them, empty: its default; and the depth."""
 KEEP_LAST_10 = RosQoS()
-SENSOR_DATA = RosQoS(Reliability.BEST_EFFORT, depth=5)
+SENSOR_DATA = RosQoS(best_effort=True, depth=5)
 """rmw_qos_profile_sensor_data."""
-LATCHED = RosQoS(durability=Durability.TRANSIENT_LOCAL, depth=1)
+LATCHED = RosQoS(transient_local=True, depth=1)
 """Who comes late gets the last message."""
 SERVICES = KEEP_LAST_10
 """rmw_qos_profile_services_default."""
@@ -246,15 +223,9 @@ def gid_of(token: str) -> bytes:
     return (number & (2**64 - 1)).to_bytes(8, "little") + (number >> 64).to_bytes(8, "little")
 
 
-def all_tokens(domain: int) -> str:
-    """Write the key expression of all tokens of a domain."""
-    return f"@ros2_lv/{domain}/**"
-
-
-def endpoints_of(domain: int, kind: Kind, name: str = "*") -> str:
-    """Write the key expression of the tokens of the endpoints of a kind, of a topic or of all (``*``)."""
-    topic = name if name == "*" else _mangle(name)
-    return f"@ros2_lv/{domain}/*/*/*/{kind.value}/*/*/*/{topic}/*/*/*"
+def endpoints_of(domain: int, kind: Kind, name: str) -> str:
+    """Write the key expression of the tokens of a topic's endpoints of a kind."""
+    return f"@ros2_lv/{domain}/*/*/*/{kind.value}/*/*/*/{_mangle(name)}/*/*/*"
 
 
 def read_token(token: str) -> Node | Endpoint | None:
@@ -262,18 +233,13 @@ def read_token(token: str) -> Node | Endpoint | None:
     parts = token.split("/") if len(token) <= LONGEST else []
     if len(parts) < _NODE_PARTS or parts[0] != "@ros2_lv" or "" in parts:
         return None
-    kind, domain = _KINDS.get(parts[5]), _number(parts[1])
+    kind, domain, node_number, number = _KINDS.get(parts[5]), *map(_number, (parts[1], parts[3], parts[4]))
     if kind is None or not isinstance(domain, int):
         return None
-    node_number, number = _number(parts[3]), _number(parts[4])
     enclave, namespace, name = map(_demangle, parts[6:9])
     node = Node(domain, parts[2], node_number, namespace or "/", name, enclave or "/")
     if kind is Kind.NODE:
         return node if len(parts) == _NODE_PARTS else None
-    return _read_endpoint(node, number, kind, parts, token)
-
-
-def _read_endpoint(node: Node, number: int | str, kind: Kind, parts: list[str], token: str) -> Endpoint | None:
     if len(parts) < _ENDPOINT_PARTS:  # later versions may say more after the QoS
         return None
     type_name, qos = ros_type(_demangle(parts[10])), read_qos(parts[12])

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from functools import lru_cache
+from collections.abc import Callable, Mapping
+from functools import cache, lru_cache
 from typing import Any
 
 from zbridge.errors import ConfigError, EncodeError, ProtocolError
@@ -21,6 +21,11 @@ _SERVICES: Mapping[str, tuple[str, str]] = {
     "example_interfaces/srv/AddTwoInts": ("int64 a\nint64 b", "int64 sum"),
 }
 """The definitions of services: rosbags knows messages only."""
+_EVENT_INFO = "uint8 event_type\nbuiltin_interfaces/Time stamp\nuint8[16] client_gid\nint64 sequence_number"
+"""``service_msgs/msg/ServiceEventInfo`` as ROS hashes it: what .msg files call char is uint8."""
+
+_Plan = tuple[Any, dict[str, Any], dict[str, tuple[str, str | None]]]
+"""A type's class, its zeros by attribute, and by field: its attribute, and the type of its parts if it has any."""
 
 
 class Types:
@@ -29,9 +34,9 @@ class Types:
     def __init__(self, distro: str, store: Any) -> None:
         self.distro = distro
         self._store = store
-        self._hashes: dict[str, str] = {}
-        self._parts: dict[str, list[tuple[str, str]]] = {}
-        self._made: dict[str, tuple[Any, dict[str, Any], dict[str, str]]] = {}
+        self.computed_hash: Callable[[str], str] = cache(store.hash_rihs01)
+        """Returns the hash of a type of a message or service; raises KeyError for an unknown type."""
+        self._made: dict[str, _Plan] = {}
         for service in _SERVICES:
             _add_service(store, service)
 
@@ -42,38 +47,28 @@ class Types:
         """Return the hash of a type as it stands in keys: ``RIHS01_...``; for humble :data:`NO_HASH`. Or KeyError."""
         return NO_HASH if self.distro == "humble" else self.computed_hash(type_name)
 
-    def computed_hash(self, type_name: str) -> str:
-        """Return the hash of a type of a message or service; raise KeyError for an unknown type."""
-        if type_name not in self._hashes:
-            self._hashes[type_name] = self._store.hash_rihs01(type_name)
-        return self._hashes[type_name]
-
-    def __contains__(self, type_name: str) -> bool:
-        return type_name in self._store.types
-
-    def message(self, type_name: str, **fields: Any) -> Any:
+    def message(self, type_name: str, /, **fields: Any) -> Any:
         """Make a message; a field that is left out is zero, empty or a message of such.
 
-        A field that this distribution does not have is left out: later ones have more. Arrays are numpy arrays. What
-        was left out is shared by all messages: it must not be changed.
+        A field that this distribution does not have is left out: later ones have more. A part may be a message, or a
+        dict of its fields. Arrays are numpy arrays. What was left out is shared by all messages: it must not be
+        changed.
         """
-        return self._make(type_name, fields)
+        plan = self._made.get(type_name)
+        if plan is None:
+            plan = self._made[type_name] = self._plan(type_name)
+        build, zeros, attributes = plan
+        given = dict(zeros)
+        for name, value in fields.items():
+            if name in attributes:
+                attribute, part = attributes[name]
+                given[attribute] = self._part(part, value) if part else value
+        return build(**given)
 
-    def nested(self, type_name: str, fields: dict[str, Any]) -> Any:
-        """Make a message as :meth:`message` does, of parts that are such fields, too, or lists of them.
-
-        ``fields`` is used up.
-        """
-        parts = self._parts.get(type_name)
-        if parts is None:
-            parts = self._parts[type_name] = _parts_of(self._store.fielddefs[type_name][1])
-        for name, part in parts:
-            if name in fields:
-                value = fields[name]
-                fields[name] = (
-                    [self.nested(part, each) for each in value] if type(value) is list else self.nested(part, value)
-                )
-        return self._make(type_name, fields)
+    def _part(self, type_name: str, value: Any) -> Any:
+        if type(value) is list:
+            return [self._part(type_name, each) for each in value]
+        return self.message(type_name, **value) if type(value) is dict else value
 
     def encode(self, message: Any) -> bytes:
         """Write a message as CDR, little-endian; raise EncodeError if a value does not fit."""
@@ -89,23 +84,13 @@ class Types:
         except Exception as error:  # rosbags reads what it was not made for: strange bytes raise strange errors
             raise ProtocolError(f"{type_name} of {len(payload)} bytes: {error}") from error
 
-    def _make(self, type_name: str, fields: Mapping[str, Any]) -> Any:
-        made = self._made.get(type_name)
-        if made is None:
-            made = self._made[type_name] = self._plan(type_name)
-        build, zeros, attributes = made
-        given = dict(zeros)
-        for name, value in fields.items():
-            attribute = attributes.get(name)
-            if attribute is not None:
-                given[attribute] = value
-        return build(**given)
+    def _plan(self, type_name: str) -> _Plan:
+        from rosbags.typesys.base import normalize_fieldname
 
-    def _plan(self, type_name: str) -> tuple[Any, dict[str, Any], dict[str, str]]:
-        """Return a type's class, its zeros by attribute, and its attributes by field."""
         fields = self._store.fielddefs[type_name][1]
-        attributes = {name: _attribute(name) for name, _ in fields}
-        return self._store.types[type_name], {attributes[name]: self._zero(kind) for name, kind in fields}, attributes
+        attributes = {name: (normalize_fieldname(name), _part_of(kind)) for name, kind in fields}
+        zeros = {attributes[name][0]: self._zero(kind) for name, kind in fields}
+        return self._store.types[type_name], zeros, attributes
 
     def _zero(self, kind: Any) -> Any:
         import numpy as np
@@ -113,7 +98,7 @@ class Types:
 
         node, inner = kind
         if node == Nodetype.NAME:
-            return self._make(inner, {})
+            return self.message(inner)
         if node == Nodetype.BASE:
             return _ZEROS.get(inner[0], 0)
         (item, of), length = inner
@@ -138,19 +123,12 @@ def types_of(distro: str) -> Types:
     return Types(distro, store)
 
 
-def _attribute(field: str) -> str:
-    from rosbags.typesys.base import normalize_fieldname
-
-    return normalize_fieldname(field)
-
-
-def _parts_of(fields: Any) -> list[tuple[str, str]]:
-    """Return the fields that are messages, or lists of messages, and the types of these."""
+def _part_of(kind: Any) -> str | None:
+    """Return the type of a field that is a message or a list of messages; None of any other field."""
     from rosbags.interfaces import Nodetype
 
-    lists = (Nodetype.ARRAY, Nodetype.SEQUENCE)
-    kinds = ((name, inner[0] if node in lists else (node, inner)) for name, (node, inner) in fields)
-    return [(name, of) for name, (node, of) in kinds if node == Nodetype.NAME]
+    node, inner = kind[1][0] if kind[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE) else kind
+    return inner if node == Nodetype.NAME else None
 
 
 def _add_service(store: Any, service: str) -> None:
@@ -158,29 +136,17 @@ def _add_service(store: Any, service: str) -> None:
     from rosbags.interfaces import Nodetype
     from rosbags.typesys import get_types_from_msg
 
-    request, response = f"{service}_Request", f"{service}_Response"
+    request, response, event = f"{service}_Request", f"{service}_Response", f"{service}_Event"
     for name, definition in zip((request, response), _SERVICES[service], strict=True):
         ((_, parsed),) = get_types_from_msg(definition or "uint8 structure_needs_at_least_one_member", name).items()
         store.register({name: parsed})
     info = "service_msgs/msg/ServiceEventInfo"
-    number = (Nodetype.BASE, ("uint8", 0))
-    store.fielddefs[info] = (
-        [],
-        [  # as ROS hashes it: what .msg files call char is uint8
-            ("event_type", number),
-            ("stamp", (Nodetype.NAME, "builtin_interfaces/msg/Time")),
-            ("client_gid", (Nodetype.ARRAY, (number, 16))),
-            ("sequence_number", (Nodetype.BASE, ("int64", 0))),
-        ],
-    )
-    event: list[Any] = [("info", (Nodetype.NAME, info))]
-    event += [
-        (field, (Nodetype.SEQUENCE, ((Nodetype.NAME, name), 1)))
-        for field, name in (("request", request), ("response", response))
-    ]
-    whole = (("request_message", request), ("response_message", response), ("event_message", f"{service}_Event"))
-    store.fielddefs[f"{service}_Event"] = ([], event)
-    store.fielddefs[service] = ([], [(field, (Nodetype.NAME, name)) for field, name in whole])
+    store.fielddefs |= get_types_from_msg(_EVENT_INFO, info)
+    parts = (("request", request), ("response", response))
+    lists = [(field, (Nodetype.SEQUENCE, ((Nodetype.NAME, name), 1))) for field, name in parts]
+    store.fielddefs[event] = ([], [("info", (Nodetype.NAME, info)), *lists])
+    messages = [(f"{field}_message", (Nodetype.NAME, name)) for field, name in (*parts, ("event", event))]
+    store.fielddefs[service] = ([], messages)
 
 
 _ZEROS: Mapping[str, Any] = {"string": "", "bool": False, "float32": 0.0, "float64": 0.0}

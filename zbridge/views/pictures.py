@@ -43,6 +43,7 @@ _END_NS = 2**32 * _SECOND_NS
 _ANGLES = struct.Struct("<BdBdB")
 _START_ANGLE, _END_ANGLE, _RANGES = 0x21, 0x29, 0x32
 """Tags of ``foxglove.LaserScan``: field number and wire type."""
+_ORIGIN = Pose(0.0, 0.0, 0.0)
 _NO_TURN = fox.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
 _HERE = fox.Pose(position=fox.Vector3(x=0.0, y=0.0, z=0.0), orientation=_NO_TURN)
 _TRAIL_COLOR = fox.Color(r=0.2, g=0.6, b=1.0, a=0.9)
@@ -79,6 +80,7 @@ class Picture(msgspec.Struct, frozen=True):
     stamp_ns: int
 
 
+@lru_cache(maxsize=65_536)
 def channels_of(robot: str, path: str) -> tuple[ViewerChannel, ...]:
     """Return the channels that the messages of a path below the robot are drawn on; none for an unknown path."""
     topic = topics.find(path)
@@ -108,7 +110,6 @@ class FoxglovePictures:
     def __init__(self, robot: str) -> None:
         self.robot = robot
         self._frame = {name: f"{robot}/{name}" for name in ("map", "base", "scan")}
-        self._channels: dict[str, tuple[ViewerChannel, ...]] = {}
         self._trail: deque[tuple[float, float]] = deque(maxlen=TRAIL_POINTS)
         self._trail_drawn_ns = self._frames_sent_ns = -_END_NS
         self._state: tuple[str, str | None] | None = None
@@ -121,14 +122,10 @@ class FoxglovePictures:
 
         now_ns: when it came, Unix nanoseconds. wanted: names of the channels to draw (``scan``, ``tf``); None: all.
         """
-        if (channels := self._channels.get(topic.path)) is None:
-            channels = channels_of(self.robot, topic.path)
-            if len(self._channels) < _KNOWN:
-                self._channels[topic.path] = channels
         stamp_ns = measured_ns(message.stamp_ns, now_ns, _END_NS)
         return [
             Picture(channel, payload, stamp_ns)
-            for channel in channels
+            for channel in channels_of(self.robot, topic.path)
             if wanted is None or channel.path in wanted
             for payload in self._drawn(channel, message, stamp_ns)
         ]
@@ -143,7 +140,7 @@ class FoxglovePictures:
 
     def _frames(self, message: FleetMessage, stamp_ns: int) -> Iterator[bytes]:
         """Tell where the frames are: with every pose, and once a second where only scans come."""
-        scanner = (self._frame["base"], self._frame["scan"], None)
+        scanner = (self._frame["base"], self._frame["scan"], _ORIGIN)
         if isinstance(message, Pose) and _is_finite(message):
             self._frames_sent_ns = stamp_ns
             yield transforms(((self._frame["map"], self._frame["base"], message), scanner), stamp_ns)
@@ -193,16 +190,16 @@ def pose_in_frame(pose: Pose, frame: str, stamp_ns: int) -> bytes | None:
     return fox.PoseInFrame(timestamp=_time(stamp_ns), frame_id=frame, pose=placed).encode()
 
 
-def transforms(placed: Iterable[tuple[str, str, Pose | None]], stamp_ns: int) -> bytes:
-    """Encode ``foxglove.FrameTransforms`` of (parent frame, child frame, the child's pose; None: the same place)."""
+def transforms(placed: Iterable[tuple[str, str, Pose]], stamp_ns: int) -> bytes:
+    """Encode ``foxglove.FrameTransforms`` of (parent frame, child frame, the child's pose)."""
     return fox.FrameTransforms(
         transforms=[
             fox.FrameTransform(
                 timestamp=_time(stamp_ns),
                 parent_frame_id=parent,
                 child_frame_id=child,
-                translation=fox.Vector3(x=pose.x, y=pose.y, z=0.0) if pose else fox.Vector3(x=0.0, y=0.0, z=0.0),
-                rotation=_turned(pose.heading) if pose else _NO_TURN,
+                translation=fox.Vector3(x=pose.x, y=pose.y, z=0.0),
+                rotation=_turned(pose.heading),
             )
             for parent, child, pose in placed
         ]
@@ -287,10 +284,6 @@ def _varint(value: int) -> bytes:
         value >>= 7
     encoded.append(value)
     return bytes(encoded)
-
-
-_KNOWN = 4096
-"""Paths whose channels are remembered."""
 
 
 class _Shape(msgspec.Struct, frozen=True):

@@ -10,7 +10,8 @@ from gateways.ros2.translate import RosRobot
 from tests.gateways.rig import drained
 from zbridge.metrics import Metrics
 from zbridge.protocol import KeyedSample, SampleKind, read_sample, write_sample
-from zbridge.ros2 import gid_of, types_of
+from zbridge.ros2.rmw_zenoh import gid_of
+from zbridge.ros2.types import types_of
 
 START_NS = 1_700_000_000_000_000_000
 TYPES = types_of("jazzy")

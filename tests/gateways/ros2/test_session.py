@@ -11,7 +11,7 @@ from gateways.ros2.messages import Velocity
 from tests.gateways.ros2.scene import KINDS, STAMPED, TWIST, TYPES, RosScene, header, key, token
 from zbridge.errors import NotReady
 from zbridge.protocol import KeyedSample, SampleKind
-from zbridge.ros2 import gid_of
+from zbridge.ros2.rmw_zenoh import gid_of
 
 WATCHED = "@ros2_lv/0/*/*/*/{}/*/*/*/%{}/*/*/*"
 ZEROS = bytes.fromhex("00010000") + bytes(48)

@@ -30,7 +30,7 @@ from tests.gateways.ros2.scene import TYPES, key
 from zbridge.errors import ConfigError, ProtocolError
 from zbridge.protocol import KeyedSample, SampleKind, Simulation, read_sample, write_sample
 from zbridge.protocol.address import Address
-from zbridge.ros2 import gid_of
+from zbridge.ros2.rmw_zenoh import gid_of
 
 make = TYPES.message
 HEADER = make("std_msgs/msg/Header", frame_id="laser")

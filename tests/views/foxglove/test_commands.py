@@ -14,7 +14,7 @@ from zbridge.errors import BusError, Held, Malformed, NeutralFirst, Refused, Uns
 from zbridge.fleet.messages import Drive
 from zbridge.views.foxglove.commands import DEADMAN_S, PAUSE_S, QUIET_S, RobotCommands
 from zbridge.views.foxglove.hub import Hub
-from zbridge.views.foxglove.requests import ClientChannel, Scale, Scales
+from zbridge.views.foxglove.requests import ClientChannel, Scale
 
 pytestmark = pytest.mark.jumping
 
@@ -138,7 +138,7 @@ class Scene:
     def __init__(self) -> None:
         self.hub, self.fleet, self.viewer = Hub(), PlayedFleet(), Viewer()
         self.hub.join(self.viewer)
-        scales = Scales(Scale(2.0, 4.0))
+        scales = {"": Scale(2.0, 4.0), "r2": Scale(1.0, 1.0)}
         self.commands = RobotCommands(self.hub, self.fleet, scales, "foxglove")  # type: ignore[arg-type]
         for name in self.fleet.robots:
             self.commands.robot_came(name)
@@ -169,6 +169,13 @@ async def soon() -> None:
 
 
 # Driving
+
+
+async def test_a_robot_with_a_scale_of_its_own_drives_by_it(scene: Scene) -> None:
+    channel = ClientChannel(3, "/r2/cmd_vel", "json", "geometry_msgs/Twist")
+    scene.commands.published(scene.viewer, channel, b'{"linear":{"x":0.5}}')
+    await soon()
+    assert scene.fleet["r2"].done == [(0.5, 0.0, 0.0)]
 
 
 async def test_a_twist_drives_in_the_name_of_the_viewer_and_silence_gives_the_robot_back(scene: Scene) -> None:

@@ -16,7 +16,7 @@ from zbridge.metrics import Metrics
 from zbridge.views.foxglove.commands import RobotCommands
 from zbridge.views.foxglove.hub import Hub
 from zbridge.views.foxglove.live import LiveSource
-from zbridge.views.foxglove.requests import Scales
+from zbridge.views.foxglove.requests import Scale
 
 GATEWAY = "fleet/r1/@alive/gateway"
 
@@ -29,7 +29,7 @@ class Scene:
         self.bus = self.robot.join("2")
         self.metrics = Metrics()
         self.hub = Hub()
-        commands = RobotCommands(self.hub, Fleet(self.bus), Scales(), "foxglove")
+        commands = RobotCommands(self.hub, Fleet(self.bus), {"": Scale()}, "foxglove")
         self.live = LiveSource(self.hub, self.bus, "fleet", frozenset(robots), commands, self.metrics)
         self.before = self.keys()
         self.live.start()

@@ -58,6 +58,6 @@ def test_a_token_is_read_from_its_file_and_makes_driving_elsewhere_possible() ->
 
 def test_scales_are_given_for_all_robots_and_for_one() -> None:
     scales = plan(FoxgloveOptions(speed_full_mps=["0.5", "r2=2"], turn_full_radps=["r3=3"])).scales
-    assert scales.of("r1") == Scale(0.5, 1.0)
-    assert scales.of("r2") == Scale(2.0, 1.0)
-    assert scales.of("r3") == Scale(0.5, 3.0)
+    assert scales[""] == Scale(0.5, 1.0)
+    assert scales["r2"] == Scale(2.0, 1.0)
+    assert scales["r3"] == Scale(0.5, 3.0)

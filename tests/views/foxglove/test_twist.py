@@ -4,7 +4,7 @@ import pytest
 
 from zbridge.errors import Malformed
 from zbridge.fleet.messages import Drive
-from zbridge.views.foxglove.requests import Scale, Scales, read_twist
+from zbridge.views.foxglove.requests import Scale, read_twist
 
 FAST = Scale(speed_full_mps=2.0, turn_full_radps=4.0)
 
@@ -34,9 +34,3 @@ def test_a_spoiled_twist_is_malformed(data: bytes) -> None:
 
 def test_a_huge_twist_is_full_speed() -> None:
     assert read_twist(b'{"linear":{"x":1e300}}', FAST) == Drive(forward=1.0)
-
-
-def test_a_robot_without_a_scale_has_that_of_the_others() -> None:
-    scales = Scales(Scale(0.5, 1.5), {"r2": FAST})
-    assert scales.of("r1") == Scale(0.5, 1.5)
-    assert scales.of("r2") == FAST

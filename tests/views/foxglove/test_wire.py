@@ -76,10 +76,14 @@ def test_a_binary_schema_is_told_as_base64() -> None:
 
 
 def test_services_are_told_with_the_schemas_of_both_ways() -> None:
-    service = Service(1, "/r1/stop", "zbridge/Stop", {"type": "object"}, {"type": "object"})
+    request, response = (
+        replies.json_schema(f"zbridge/Stop{way}", {"type": "object"}) for way in ("Request", "Response")
+    )
+    service = Service(1, "/r1/stop", "zbridge/Stop", request, response)
     (entry,) = json.loads(replies.advertise_services([service]))["services"]
     assert (entry["id"], entry["name"], entry["type"]) == (1, "/r1/stop", "zbridge/Stop")
     assert entry["request"]["encoding"] == entry["response"]["encoding"] == "json"
+    assert entry["response"]["schemaName"] == "zbridge/StopResponse"
     assert json.loads(entry["request"]["schema"]) == {"type": "object"}
 
 

@@ -8,7 +8,7 @@ import struct
 import pytest
 
 from zbridge.errors import Malformed, ProtocolError, Unsupported
-from zbridge.ros2 import types_of
+from zbridge.ros2.types import types_of
 from zbridge.views.ros2.cmd_vel import STAMPED, TWIST, drive_of, read_twist
 from zbridge.views.ros2.settings import RobotBody
 

@@ -16,7 +16,8 @@ from zbridge.fleet.messages import Device, Devices, Pose, Reading, Scan, Scanner
 from zbridge.fleet.payload import encode
 from zbridge.fleet.topics import KeySpace
 from zbridge.metrics import Metrics
-from zbridge.ros2 import read_attachment, types_of
+from zbridge.ros2.rmw_zenoh import read_attachment
+from zbridge.ros2.types import types_of
 from zbridge.views.ros2.node import RobotNode
 from zbridge.views.ros2.outlets import RosSide
 from zbridge.views.ros2.pictures import RosPictures

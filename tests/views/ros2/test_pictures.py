@@ -26,7 +26,7 @@ from zbridge.fleet.messages import (
     Status,
 )
 from zbridge.metrics import Metrics
-from zbridge.ros2 import DISTROS, types_of
+from zbridge.ros2.types import DISTROS, types_of
 from zbridge.views.ros2.pictures import TOPICS, RosPictures
 from zbridge.views.ros2.settings import Mount, RobotBody
 

@@ -11,7 +11,7 @@ import pytest
 from tests.fake_bus import FakeBus
 from zbridge.errors import ConfigError
 from zbridge.metrics import Metrics
-from zbridge.ros2 import types_of
+from zbridge.ros2.types import types_of
 from zbridge.views.ros2 import server
 from zbridge.views.ros2.outlets import RosSide
 from zbridge.views.ros2.server import HIDDEN_AFTER_S, View

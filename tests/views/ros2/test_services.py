@@ -12,8 +12,8 @@ import pytest
 from tests.fake_bus import FakeBus, FakeQuery
 from zbridge.errors import BusError, Held, Malformed, NotReady
 from zbridge.metrics import Metrics
-from zbridge.ros2 import types_of
 from zbridge.ros2.rmw_zenoh import read_attachment
+from zbridge.ros2.types import types_of
 from zbridge.views.ros2.outlets import RosSide
 from zbridge.views.ros2.services import AT_ONCE, MOST_BYTES, Services
 

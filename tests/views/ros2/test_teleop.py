@@ -15,7 +15,8 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Control
 from zbridge.fleet.payload import encode
 from zbridge.metrics import Metrics
-from zbridge.ros2 import KEEP_LAST_10, Attachment, Endpoint, Kind, Node, types_of
+from zbridge.ros2.rmw_zenoh import KEEP_LAST_10, Attachment, Endpoint, Kind, Node
+from zbridge.ros2.types import types_of
 from zbridge.views.ros2.cmd_vel import TWIST
 from zbridge.views.ros2.diagnostics import OK, WARN
 from zbridge.views.ros2.driving import PUBLISHERS

@@ -28,10 +28,11 @@ from zbridge.client.stops import Outcome
 from zbridge.errors import Held, Malformed, Unsupported, ZbridgeError
 from zbridge.fleet.topics import is_name
 from zbridge.lease.stick import Stick, StickRules
+from zbridge.tasks import Tasks
 from zbridge.views.foxglove import replies
 from zbridge.views.foxglove.hub import Hub, Subscriber
 from zbridge.views.foxglove.replies import Service
-from zbridge.views.foxglove.requests import ClientChannel, Scales, read_twist
+from zbridge.views.foxglove.requests import ClientChannel, Scale, read_twist
 from zbridge.views.foxglove.source import ViewerCommands
 
 DEADMAN_S = 0.5
@@ -60,9 +61,12 @@ _UNTOUCHED: Mapping[str, Any] = {"light": False, "lidar": False, "camera": False
 
 
 class RobotCommands(ViewerCommands):
-    """Carries out what viewers tell the robots of a fleet. who: what drivers are called first."""
+    """Carries out what viewers tell the robots of a fleet.
 
-    def __init__(self, hub: Hub, fleet: Fleet, scales: Scales, who: str) -> None:
+    scales: of robots by name, and of all others by ``""``. who: what drivers are called first.
+    """
+
+    def __init__(self, hub: Hub, fleet: Fleet, scales: Mapping[str, Scale], who: str) -> None:
         self._hub = hub
         self._fleet = fleet
         self._scales = scales
@@ -75,7 +79,7 @@ class RobotCommands(ViewerCommands):
         self._ids = itertools.count(1)
         self._stops: dict[str, asyncio.Task[None]] = {}
         self._stop_again: set[str] = set()
-        self._releases: set[asyncio.Task[None]] = set()
+        self._releases = Tasks()
         for what in _OF_ALL:
             self._add("", what)
 
@@ -85,7 +89,7 @@ class RobotCommands(ViewerCommands):
     async def close(self) -> None:
         """Release all robots; stops that are on their way arrive."""
         pilots = [pilot.close() for pilot in self._pilots.values()]
-        await asyncio.gather(*pilots, *self._stops.values(), *self._releases, return_exceptions=True)
+        await asyncio.gather(*pilots, *self._stops.values(), *self._releases.running, return_exceptions=True)
         self._pilots.clear()
 
     # Robots come and go
@@ -113,7 +117,9 @@ class RobotCommands(ViewerCommands):
     def _add(self, robot: str, what: str) -> Service:
         number = next(self._ids)
         name = f"/{robot}/{what}" if robot else f"/{what}"
-        service = Service(number, name, f"zbridge/{what.capitalize()}", _ASKED[what], _ANSWERED)
+        kind = f"zbridge/{what.capitalize()}"
+        request = replies.json_schema(f"{kind}Request", _ASKED[what])
+        service = Service(number, name, kind, request, replies.json_schema(f"{kind}Response", _ANSWERED))
         self._services[number] = (robot, what, service)
         return service
 
@@ -128,16 +134,14 @@ class RobotCommands(ViewerCommands):
         if channel.schema_name not in _TWISTS:
             raise Unsupported(f"{channel.topic}: schema {channel.schema_name!r:.80}: expected {_TWISTS[0]!r}")
         self._may(viewer)
-        self._pilot(viewer, robot).drive(read_twist(payload, self._scales.of(robot)))
+        self._pilot(viewer, robot).drive(read_twist(payload, self._scales.get(robot, self._scales[""])))
 
     def unpublished(self, viewer: Subscriber, channel: ClientChannel) -> None:
         """Release the robot that was driven on a channel."""
         robot, _, what = channel.topic.strip("/").partition("/")
         pilot = self._pilots.pop((viewer, robot), None) if what == CMD_VEL else None
         if pilot is not None:
-            task = asyncio.get_running_loop().create_task(pilot.close())
-            self._releases.add(task)
-            task.add_done_callback(self._releases.discard)
+            self._releases.start(pilot.close())
 
     def _aim(self, channel: ClientChannel) -> tuple[str, str]:
         """Return the robot and what is published for it; raise Refused for anything else."""
@@ -207,10 +211,7 @@ class RobotCommands(ViewerCommands):
             asked = msgspec.json.decode(payload or b"{}", type=dict[str, Any])
         except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
             raise Malformed(f"{service.name}: {error}") from error
-        if what in _OF_ALL:
-            await self._stop_or_release(viewer, robot, what, asked.get("reason"))
-        else:
-            await self._carry_out(viewer, robot, what, asked.get("mode" if what == "mode" else "on"))
+        await self._carry_out(viewer, robot, what, asked.get(_ARGUMENT.get(what, "on")))
         return b'{"ok":true}'
 
     def parameters(self, names: tuple[str, ...]) -> dict[str, Any]:
@@ -227,26 +228,24 @@ class RobotCommands(ViewerCommands):
         if what != STOP or value is True:
             await self._carry_out(viewer, robot, what, value)
 
-    async def _stop_or_release(self, viewer: Subscriber, robot: str, what: str, reason: object) -> None:
-        """Stop, latch or unlatch one robot, or all."""
+    async def _carry_out(self, viewer: Subscriber, robot: str, what: str, value: Any) -> None:
+        """Carry out a service for a robot, or for all. value: a latch's reason, the mode, or whether it is on."""
+        robots = [robot] if robot else sorted(self._robots)
         if what == STOP:
-            await self._stop([robot] if robot else sorted(self._robots))
+            await self._stop(robots)
         elif what == LATCH:
-            self._stopped([robot] if robot else sorted(self._robots))
-            why = reason if isinstance(reason, str) else None
-            _raise_first(await self._fleet.latch([robot] if robot else None, why))
+            self._stopped(robots)
+            _raise_first(await self._fleet.latch([robot] if robot else None, value if isinstance(value, str) else None))
         else:
             self._may(viewer)
-            if robot:
+            if what != UNLATCH:
+                await self._set(viewer, robot, what, value)
+            elif robot:
                 await self._fleet[robot].unlatch()
             else:
                 _raise_first(await self._fleet.unlatch())
 
-    async def _carry_out(self, viewer: Subscriber, robot: str, what: str, value: Any) -> None:
-        if what == STOP:
-            await self._stop([robot])
-            return
-        self._may(viewer)
+    async def _set(self, viewer: Subscriber, robot: str, what: str, value: Any) -> None:
         expected = _MODES if what == "mode" else (True, False)
         if not isinstance(value, bool | str) or value not in expected:
             raise Malformed(f"{what} = {value!r:.40}: expected one of {', '.join(map(repr, expected))}")
@@ -291,4 +290,5 @@ _ASKED: Mapping[str, Mapping[str, Any]] = {
     "mode": {"type": "object", "properties": {"mode": {"type": "string", "enum": list(_MODES)}}},
     **dict.fromkeys(_SWITCHES, _SWITCH),
 }
+_ARGUMENT = {LATCH: "reason", "mode": "mode"}
 _ANSWERED = {"type": "object", "properties": {"ok": {"type": "boolean"}}}

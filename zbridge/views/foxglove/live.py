@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import msgspec
@@ -125,27 +125,22 @@ class LiveSource(ViewerSource):
         del self._shown[name]
         shown.subscribed.need(set())
 
-    def _offer(self, shown: _Shown, channels: Any) -> None:
-        new = [channel for channel in channels if channel.path not in shown.offered]
-        shown.offered.update((channel.path, channel) for channel in new)
-        self._left_out.value += self.hub.offer(new)
+    def _offer(self, shown: _Shown, channels: Collection[ViewerChannel]) -> None:
+        shown.offered.update((channel.path, channel) for channel in channels)
+        self._left_out.value += self.hub.offer(channels)
 
     def _on_devices(self, sample: Sample) -> None:
         """Offer a channel for each sensor that a robot announces."""
-        split = split_key(sample.key)
-        shown = self._shown.get(split[1]) if split is not None else None
+        shown = self._shown.get(sample.key.split("/")[1])
         if shown is not None and (devices := read_payload(Devices, sample.payload, self._malformed)) is not None:
             for device in devices.devices:
                 self._found(shown, topics.SENSOR(device.name).path)
 
     def _on_control(self, sample: Sample) -> None:
-        split = split_key(sample.key)
-        if split is None or split[1] not in self._shown:
-            return
-        control = read_payload(Control, sample.payload, self._malformed)
-        if control is not None:
+        name = sample.key.split("/")[1]
+        if name in self._shown and (control := read_payload(Control, sample.payload, self._malformed)) is not None:
             text = "; ".join(latch.described for latch in control.latches)
-            self.hub.warn(f"latched.{split[1]}", f"{split[1]}: {text}" if text else None)
+            self.hub.warn(f"latched.{name}", f"{name}: {text}" if text else None)
 
     def _found(self, shown: _Shown, path: str) -> None:
         if path not in shown.offered and shown.sensors < SENSORS:

@@ -127,12 +127,12 @@ class IndexedRecording:
 
     def _read_through(self) -> None:
         """Read everything up to the cut, for channels and times."""
-        begin_ns, end_ns = _LAST_NS, 0
+        self.begin_ns = _LAST_NS
         with self.path.open("rb") as file:
             for schema, channel, message in self._until_fault(file):
                 self._add(channel, schema)
-                begin_ns, end_ns = min(begin_ns, message.log_time), max(end_ns, message.log_time)
-        self.begin_ns, self.end_ns = begin_ns, end_ns
+                self.begin_ns = min(self.begin_ns, message.log_time)
+                self.end_ns = max(self.end_ns, message.log_time)
 
     def _add(self, channel: Any, schema: Any) -> None:
         encoding = channel.message_encoding
@@ -227,7 +227,8 @@ class Playback(ViewerSource):
                     continue
                 ahead.reverse()
             now = self._loop.time()
-            self._delay_clock(ahead, now)
+            if ahead and self._clock.playing and self._clock.wait_s(ahead[-1].log_ns, now) < -LATE_S:
+                self._clock.seek(ahead[-1].log_ns, now)  # reading cannot keep up with the clock
             while ahead and self._clock.playing and self._clock.wait_s(ahead[-1].log_ns, now) <= 0:
                 message = ahead.pop()
                 self.hub.publish(message.topic, message.log_ns, message.payload)
@@ -246,11 +247,6 @@ class Playback(ViewerSource):
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(wait_s):
                 await self._changed.wait()
-
-    def _delay_clock(self, ahead: list[PlayedMessage], now: float) -> None:
-        """Set the clock back if reading cannot keep up with it."""
-        if ahead and self._clock.playing and self._clock.wait_s(ahead[-1].log_ns, now) < -LATE_S:
-            self._clock.seek(ahead[-1].log_ns, now)
 
     def _send_time(self, *, ended: bool) -> None:
         now_ns = self._now_ns()

@@ -24,13 +24,13 @@ _encode = msgspec.json.Encoder().encode
 
 
 class Service(msgspec.Struct, frozen=True):
-    """A service that viewers can call. request, response: JSON schemas."""
+    """A service that viewers can call. request, response: of :func:`json_schema`."""
 
     id: int
     name: str
     type: str
-    request: Mapping[str, Any]
-    response: Mapping[str, Any]
+    request: Mapping[str, str]
+    response: Mapping[str, str]
 
 
 class PlaybackStatus(IntEnum):
@@ -98,17 +98,7 @@ def warning(message: str, name: str | None = None) -> str:
 
 def advertise_services(services: Iterable[Service]) -> str:
     """Offer services."""
-    entries = [
-        {
-            "id": service.id,
-            "name": service.name,
-            "type": service.type,
-            "request": _json_schema(f"{service.type}Request", service.request),
-            "response": _json_schema(f"{service.type}Response", service.response),
-        }
-        for service in services
-    ]
-    return text("advertiseServices", services=entries)
+    return text("advertiseServices", services=list(services))
 
 
 def service_response(call: ServiceCall, payload: bytes) -> bytes:
@@ -138,7 +128,8 @@ def playback_state(status: PlaybackStatus, now_ns: int, speed: float, *, sought:
     return _STATE.pack(5, status, now_ns, speed, sought, len(encoded)) + encoded
 
 
-def _json_schema(name: str, schema: Mapping[str, Any]) -> dict[str, str]:
+def json_schema(name: str, schema: Mapping[str, Any]) -> dict[str, str]:
+    """Write a schema of a service's request or response."""
     return {
         "encoding": "json",
         "schemaName": name,

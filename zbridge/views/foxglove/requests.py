@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping
 from typing import Annotated, Any
 
 import msgspec
@@ -139,17 +138,6 @@ class Scale(msgspec.Struct, frozen=True):
 
     speed_full_mps: float = 1.0
     turn_full_radps: float = 1.0
-
-
-class Scales(msgspec.Struct, frozen=True):
-    """The scales of robots by name, and of all others."""
-
-    others: Scale = Scale()
-    robots: Mapping[str, Scale] = {}
-
-    def of(self, robot: str) -> Scale:
-        """Return the scale of a robot."""
-        return self.robots.get(robot, self.others)
 
 
 class _Vector(msgspec.Struct, frozen=True):

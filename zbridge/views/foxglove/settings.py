@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import msgspec
@@ -13,7 +13,7 @@ from zbridge.fleet.topics import is_name
 from zbridge.protocol.address import Address
 from zbridge.protocol.networks import is_loopback, parse_network
 from zbridge.views.foxglove.admission import FOXGLOVE_ORIGINS, Policy
-from zbridge.views.foxglove.requests import Scale, Scales
+from zbridge.views.foxglove.requests import Scale
 
 TOKEN_CHARACTERS = 16
 """The shortest token."""
@@ -39,11 +39,11 @@ class FoxgloveOptions(msgspec.Struct, frozen=True):
 
 
 class FoxglovePlan(msgspec.Struct, frozen=True):
-    """What the server starts from. tls: certificate and key."""
+    """What the server starts from. scales: by robot, of others by ``""``. tls: certificate and key."""
 
     address: Address
     policy: Policy
-    scales: Scales
+    scales: Mapping[str, Scale]
     robots: frozenset[str]
     tls: tuple[str, str] | None
     metrics: Address | None = None
@@ -101,20 +101,16 @@ def _origin(text: str) -> str:
     return text
 
 
-def _scales(options: FoxgloveOptions) -> Scales:
+def _scales(options: FoxgloveOptions) -> dict[str, Scale]:
     speeds = _by_robot("--speed-full-mps", options.speed_full_mps)
     turns = _by_robot("--turn-full-radps", options.turn_full_radps)
-    others = Scale(speeds.get("", Scale().speed_full_mps), turns.get("", Scale().turn_full_radps))
-    robots = {
-        robot: Scale(speeds.get(robot, others.speed_full_mps), turns.get(robot, others.turn_full_radps))
-        for robot in (speeds.keys() | turns.keys()) - {""}
-    }
-    return Scales(others, robots)
+    robots = speeds.keys() | turns.keys()
+    return {robot: Scale(speeds.get(robot, speeds[""]), turns.get(robot, turns[""])) for robot in robots}
 
 
 def _by_robot(option: str, texts: Sequence[str]) -> dict[str, float]:
     """Read ``0.5`` (all robots, by the name ``""``) and ``r1=0.5``."""
-    values = {}
+    values = {"": 1.0}
     for text in texts:
         robot, _, number = text.rpartition("=")
         try:

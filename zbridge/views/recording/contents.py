@@ -29,7 +29,7 @@ from zbridge.views.schemas import Schema
 if TYPE_CHECKING:
     from zbridge.views.pictures import FoxglovePictures, ViewerChannel
 
-MSGPACK, OCTETS, JSON = "msgpack", "octet-stream", "json"
+MSGPACK, OCTETS = "msgpack", "octet-stream"
 SENT = "/@sent"
 """Ends the topic that stands beside a command's."""
 
@@ -126,8 +126,6 @@ class Pictures:
             from zbridge.views.pictures import FoxglovePictures
         except ImportError as error:
             raise ConfigError(f"pictures {EXTRA}, or --only fleet") from error
-        self.undrawn = 0
-        """Messages that could not be read."""
         self._make = FoxglovePictures
         self._robots: dict[str, FoxglovePictures] = {}
 
@@ -144,7 +142,6 @@ class Pictures:
         try:
             message = payloads.decode(topic.message, payload)
         except PayloadError:
-            self.undrawn += 1
             return
         for picture in robot.draw(topic, message, now_ns):
             yield _drawn_on(picture.channel), picture.stamp_ns, picture.payload

@@ -13,8 +13,6 @@ from collections.abc import Callable
 
 import msgspec
 
-BOUND_BYTES = 64 * 2**20
-"""Bytes that may wait for the disk."""
 OVERHEAD_BYTES = 200
 """What a message costs in memory besides its payload, about."""
 KEYS = 4096
@@ -40,12 +38,11 @@ class Losses(Counter[str]):
 
 
 class Intake:
-    """The queue between bus and disk. ``clock_ns``: Unix time."""
+    """The queue between bus and disk. bound_bytes: that may wait for the disk."""
 
-    def __init__(self, bound_bytes: int = BOUND_BYTES, clock_ns: Callable[[], int] = time.time_ns) -> None:
+    def __init__(self, bound_bytes: int) -> None:
         self.dropped = Losses()
         self._bound = bound_bytes
-        self._clock_ns = clock_ns
         self._lock = threading.Lock()
         self._waiting: list[Arrival] = []
         self._bytes = 0
@@ -67,7 +64,7 @@ class Intake:
                 self.dropped.add(key)
                 return False
             self._bytes += size
-            self._waiting.append(Arrival(self._clock_ns(), key, read_payload(), attachment))
+            self._waiting.append(Arrival(time.time_ns(), key, read_payload(), attachment))
         return True
 
     def take(self) -> list[Arrival]:

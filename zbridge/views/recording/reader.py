@@ -25,8 +25,6 @@ RECORD_BYTES = 64 * 2**20
 """Longest record that is read."""
 CHUNK_BYTES = 256 * 2**20
 """Largest chunk, uncompressed."""
-CHANNELS = 65_536
-"""As many as there are ids."""
 TEXT_BYTES = 1024
 """Longest topic, and longest name of a schema or of an encoding."""
 SCHEMA_BYTES = 2**20
@@ -121,16 +119,15 @@ class RecordingReader:
                 self._read_record(opcode, memoryview(content))
 
     def _inner(self, data: bytes) -> Iterator[RecordedMessage]:
-        view, at, end = memoryview(data), 0, len(data)
-        while at < end:
-            if end - at < _HEAD.size:
+        view = memoryview(data)
+        while view:
+            if len(view) < _HEAD.size:
                 raise BrokenError("a chunk ends in the head of a record")
-            opcode, length = _HEAD.unpack_from(view, at)
-            at += _HEAD.size
-            if length > end - at:
-                raise BrokenError(f"a record of {length} bytes in a chunk that has {end - at} more")
-            content = view[at : at + length]
-            at += length
+            opcode, length = _HEAD.unpack_from(view)
+            view = view[_HEAD.size :]
+            if length > len(view):
+                raise BrokenError(f"a record of {length} bytes in a chunk that has {len(view)} more")
+            content, view = view[:length], view[length:]
             if opcode == _MESSAGE_OP:
                 yield self._message(content)
             else:

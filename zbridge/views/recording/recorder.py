@@ -8,6 +8,7 @@ are ended with what they hold, ``error`` says why, and what still arrives is cou
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 import time
@@ -178,8 +179,7 @@ class Recorder:
     # One message
 
     def _write(self, arrival: Arrival) -> None:
-        known = self._tracks.get((arrival.key, arrival.attachment == topics.WIRE_DATAGRAM))
-        track = known or self._track(arrival.key, arrival.attachment)
+        track = self._track(arrival.key, arrival.attachment)
         self.messages += 1
         publish_ns = self._write_own(track, arrival)
         topic = track.topic
@@ -258,13 +258,11 @@ class Recorder:
         if key in self._states or len(self._states) < STATES:
             self._states[key] = arrival
         robot = key.rpartition("/")[0]
-        try:
+        with contextlib.suppress(PayloadError):
             if topic is topics.CONTROL:
                 self._note_holder(robot, payloads.decode(Control, arrival.payload))
             elif topic is topics.STATUS:
                 self._describe(robot, payloads.decode(Status, arrival.payload))
-        except PayloadError:
-            return
 
     def _note_holder(self, robot: str, control: Control) -> None:
         if control.lease is None or control.holder is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -155,7 +155,7 @@ class Replay:
         async with contextlib.AsyncExitStack() as stack:
             watching = []
             for recorded, name in self._plan.names.items():
-                ownership = await stack.enter_async_context(self._claimed(name))
+                ownership = await self._claim(name, stack)
                 keys, status = KeySpace(self._plan.realm, name), self._plan.statuses.get(recorded)
                 robot = ReplayedRobot(self._bus, keys, f"a recording of {recorded}", status)
                 self.robots[recorded] = robot
@@ -167,22 +167,19 @@ class Replay:
             self.player.start()
             await race(self._ended.wait(), *watching, *serving)
 
-    @contextlib.asynccontextmanager
-    async def _claimed(self, name: str) -> AsyncIterator[Ownership]:
-        """Claim a name as a gateway does: gateways that come later wait, and say so."""
-        keys = KeySpace(self._plan.realm, name)
+    async def _claim(self, name: str, stack: contextlib.AsyncExitStack) -> Ownership:
+        """Claim a name as a gateway does, until the stack is left: gateways that come later wait, and say so."""
+        keys, taken = KeySpace(self._plan.realm, name), Held(f"{name} is alive: replay it under another name")
         if await self._bus.alive(keys.alive("gateway")):
-            raise Held(f"{name} is alive: replay it under another name")
+            raise taken
         ownership = Ownership(self._bus, keys)
+        stack.callback(ownership.release)
         try:
-            try:
-                async with asyncio.timeout(CLAIM_S):
-                    await ownership.take()
-            except TimeoutError:
-                raise Held(f"{name} is alive: replay it under another name") from None
-            yield ownership
-        finally:
-            ownership.release()
+            async with asyncio.timeout(CLAIM_S):
+                await ownership.take()
+        except TimeoutError:
+            raise taken from None
+        return ownership
 
     async def _watch(self, ownership: Ownership, name: str) -> None:
         await ownership.watch(_Replayed())
@@ -190,21 +187,17 @@ class Replay:
 
     # The player's thread
 
-    def _skip(self, message: RecordedMessage) -> None:
-        """Keep the last state of each key from before the selected part: who comes later knows it, too."""
+    def _play(self, message: RecordedMessage, selected: bool) -> None:
+        """Play a message; keep the last state of each key from before the selected part, and play these first."""
+        if selected:
+            earlier, self._earlier = self._earlier, {}
+            for each in (*earlier.values(), message):
+                self._play_now(each)
+            return
         split = split_key(message.channel.topic)
         topic = topics.find(split[2]) if split is not None else None
         if topic is not None and topic.delivery is Delivery.STATE and len(self._earlier) < KEYS:
             self._earlier[message.channel.topic] = message
-
-    def _play(self, message: RecordedMessage, selected: bool) -> None:
-        if not selected:
-            self._skip(message)
-            return
-        earlier, self._earlier = self._earlier, {}
-        for state in earlier.values():
-            self._play_now(state)
-        self._play_now(message)
 
     def _play_now(self, message: RecordedMessage) -> None:
         topic = message.channel.topic
@@ -235,11 +228,8 @@ class Replay:
         keys = KeySpace(self._plan.realm, self._plan.names[recorded])
         bus = AsRecorded(self._bus, self.robots[recorded])
         robot = RobotSubscription(cast("Bus", bus), keys, metrics)
-
-        def answer(query: Any) -> None:
-            query.answer(payloads.encode(Sessions(sessions.snapshots())))
-
-        shown = self._bus.answer(keys.key(topics.RPC_SESSIONS("gateway").path), answer)
+        key = keys.key(topics.RPC_SESSIONS("gateway").path)
+        shown = self._bus.answer(key, lambda query: query.answer(payloads.encode(Sessions(sessions.snapshots()))))
         listeners = [
             Listener(plan, f"replay-{number}", robot, sessions, metrics)
             for number, plan in enumerate(self._plan.listeners, 1)
@@ -269,13 +259,11 @@ class AsRecorded:
 
     def subscribe(self, key_expr: str, handler: Callable[[Sample], None], **options: Any) -> Handle:
         """Subscribe as :class:`zbridge.bus.Bus` does."""
-
-        def show(sample: Sample) -> None:
-            handler(self._original(sample) if sample.key.endswith(_STATUS) else sample)
-
-        return self._bus.subscribe(key_expr, show, **options)
+        return self._bus.subscribe(key_expr, lambda sample: handler(self._original(sample)), **options)
 
     def _original(self, sample: Sample) -> Sample:
+        if not sample.key.endswith(_STATUS):
+            return sample
         try:
             status = payloads.decode(Status, sample.payload)
         except PayloadError:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import deque
-from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -44,22 +43,12 @@ _LEASE = ("acquire/*", "takeover/*", "renew", "release", "unlatch/*", "unlatch_f
 class ReplayedRobot:
     """Publishes what a recording has of one robot. reason: shown by ``status``; status: shown until one is played."""
 
-    def __init__(
-        self,
-        bus: Bus,
-        keys: KeySpace,
-        reason: str,
-        status: Status | None = None,
-        clock_ns: Callable[[], int] = time.time_ns,
-    ) -> None:
+    def __init__(self, bus: Bus, keys: KeySpace, reason: str, status: Status | None = None) -> None:
         self.recorded_protocol: str | None = None
         """The robot's own protocol, as its last status said."""
-        self.unplayed = 0
-        """Messages that could not be read, or whose key has no place."""
         self._bus = bus
         self._keys = keys
         self._reason = reason
-        self._clock_ns = clock_ns
         self._publishers: dict[str, Publisher] = {}
         self._topics: dict[str, Topic | None] = {}
         self._last: dict[str, bytes] = {}
@@ -110,7 +99,7 @@ class ReplayedRobot:
         topic = self._topic(path)
         if topic is None:
             return False
-        now_ns = self._clock_ns()
+        now_ns = time.time_ns()
         payload = with_stamp(message.data, now_ns - max(0, message.log_ns - message.publish_ns))
         if topic is topics.STATUS or topic is topics.CONTROL:
             return self._play_state(topic, payload)
@@ -128,7 +117,6 @@ class ReplayedRobot:
                 self._control = payloads.decode(Control, payload)
                 self._publish_control()
         except PayloadError:
-            self.unplayed += 1
             return False
         return True
 
@@ -140,15 +128,11 @@ class ReplayedRobot:
 
     def _topic(self, path: str) -> Topic | None:
         """Return the topic of what is published of a path; None for commands, queries and what is not known."""
-        if path in self._topics:
-            return self._topics[path]
-        topic = None if path.startswith("@") else topics.find(path)
-        if topic is None or topic.delivery not in (Delivery.STREAM, Delivery.STATE) or len(self._topics) >= KEYS:
-            self.unplayed += not path.startswith("@")
-            topic = None
-        if len(self._topics) < KEYS:
-            self._topics[path] = topic
-        return topic
+        if path not in self._topics and len(self._topics) < KEYS:
+            topic = None if path.startswith("@") else topics.find(path)
+            published = topic is not None and topic.delivery in (Delivery.STREAM, Delivery.STATE)
+            self._topics[path] = topic if published else None
+        return self._topics.get(path)
 
     def _put(self, topic: Topic, payload: bytes) -> None:
         publisher = self._publishers.get(topic.path)
@@ -162,11 +146,11 @@ class ReplayedRobot:
     # On the event loop, or the player's thread
 
     def _publish_status(self) -> None:
-        self._publish(topics.STATUS, msgspec.structs.replace(self._status, stamp_ns=self._clock_ns()))
+        self._publish(topics.STATUS, msgspec.structs.replace(self._status, stamp_ns=time.time_ns()))
 
     def _publish_control(self, **shown: Any) -> None:
         refusals = (*self._control.refusals, *self._refusals.shown())
-        own = {"stamp_ns": self._clock_ns(), "lease": None, "refusals": refusals, "stops": tuple(self._stops)}
+        own = {"stamp_ns": time.time_ns(), "lease": None, "refusals": refusals, "stops": tuple(self._stops)}
         self._publish(topics.CONTROL, msgspec.structs.replace(self._control, **(own | shown)))
 
     def _publish(self, topic: Topic, message: FleetMessage) -> None:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
@@ -20,8 +19,6 @@ from zbridge.fleet.topics import KeySpace
 from zbridge.protocol.address import Address
 from zbridge.views.recording.reader import RecordingReader, open_recording
 from zbridge.views.recording.wire_tape import WireStep, steps
-
-log = logging.getLogger("zbridge.views.recording")
 
 ANSWER_S = 2.0
 """Longest time that a frame of the handshake waits for the gateway; then no other one of the conversation waits."""
@@ -33,14 +30,7 @@ _READ = 65_536
 class WireLink(asyncio.DatagramProtocol):
     """One link of the robot. report: called with what happens, for people."""
 
-    def __init__(
-        self,
-        path: Path,
-        keys: KeySpace,
-        link: str,
-        speed: float = 1.0,
-        report: Callable[[str], object] = lambda _: None,
-    ) -> None:
+    def __init__(self, path: Path, keys: KeySpace, link: str, speed: float, report: Callable[[str], object]) -> None:
         self.link = link
         self.frames = 0
         self.unanswered = 0

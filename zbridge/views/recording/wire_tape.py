@@ -67,7 +67,5 @@ def steps(messages: Iterable[RecordedMessage], keys: KeySpace, link: str) -> Ite
 
 def _state(payload: bytes, link: str) -> str | None:
     with contextlib.suppress(PayloadError):
-        for entry in payloads.decode(Status, payload).links:
-            if entry.name == link:
-                return entry.state
+        return next((entry.state for entry in payloads.decode(Status, payload).links if entry.name == link), None)
     return None

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from zbridge.errors import Malformed, Unsupported
 from zbridge.fleet.messages import Drive
 from zbridge.protocol.kinematics import within_full_scale
-from zbridge.ros2 import Types
+from zbridge.ros2.types import Types
 from zbridge.views.ros2.settings import RobotBody
 
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
@@ -43,26 +43,23 @@ def read_twist(types: Types, type_name: str, payload: bytes, body: RobotBody) ->
 
 
 def drive_of(forward_mps: float, left_mps: float, turn_radps: float, body: RobotBody) -> Drive:
-    """Scale speeds to a Drive. Above full scale all parts are scaled down alike: the curve stays. Or Unsupported."""
+    """Scale speeds to a Drive; raise Unsupported for what a robot that steers cannot do.
+
+    Above full scale all parts are scaled down alike: the curve stays. A robot that steers turns its wheels so that it
+    runs the circle of radius v / omega: by atan(wheelbase x omega / v).
+    """
     forward_mps, left_mps, turn_radps = (
         0.0 if abs(value) < _STILL else value for value in (forward_mps, left_mps, turn_radps)
     )
     forward, left = forward_mps / body.speed_full_mps, left_mps / body.speed_full_mps
-    if body.wheelbase_m is not None:
-        return _steered(forward, forward_mps, left_mps, turn_radps, body.wheelbase_m, body.steer_full_rad)
-    return within_full_scale(forward, left, turn_radps / body.turn_full_radps)
-
-
-def _steered(
-    forward: float, forward_mps: float, left_mps: float, turn_radps: float, wheelbase_m: float, full_rad: float
-) -> Drive:
-    """Turn the wheels so that the robot runs the circle of radius v / omega: by atan(wheelbase x omega / v)."""
+    if body.wheelbase_m is None:
+        return within_full_scale(forward, left, turn_radps / body.turn_full_radps)
     if left_mps:
         raise Unsupported("cmd_vel: linear.y: a robot that steers does not move sideways")
     if turn_radps and not forward_mps:
         raise Unsupported("cmd_vel: angular.z without linear.x: a robot that steers does not turn on the spot")
-    angle = math.atan(wheelbase_m * turn_radps / abs(forward_mps)) if forward_mps else 0.0
-    return Drive(forward=_held(forward), turn=_held(angle / full_rad))
+    angle = math.atan(body.wheelbase_m * turn_radps / abs(forward_mps)) if forward_mps else 0.0
+    return Drive(forward=_held(forward), turn=_held(angle / body.steer_full_rad))
 
 
 def _held(value: float) -> float:

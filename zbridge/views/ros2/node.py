@@ -12,8 +12,8 @@ from zbridge.bus import Bus, Handle, Sample
 from zbridge.client import Fleet
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Devices, FleetMessage
-from zbridge.fleet.topics import KeySpace, Topic, is_concrete
-from zbridge.ros2 import LATCHED, Kind
+from zbridge.fleet.topics import KeySpace, is_concrete
+from zbridge.ros2.rmw_zenoh import LATCHED, Kind
 from zbridge.views.live_robots import OnDemandSubscriptions, read_payload
 from zbridge.views.ros2.outlets import Outlet, RosSide
 from zbridge.views.ros2.pictures import TOPICS, RosPictures, RosTopic
@@ -114,17 +114,14 @@ class RobotNode:
 
     def _subscribe_to(self, path: str) -> Handle:
         topic = topics.find(path) if is_concrete(path) else None
-        handler = partial(self._receive, path, topic) if topic is not None else self._receive_any
         history = topic is not None and topic.qos.keeps_last
-        return self._bus.subscribe(self._keys.key(path), handler, history=history, direct=not history)
+        return self._bus.subscribe(self._keys.key(path), self._receive, history=history, direct=not history)
 
-    def _receive_any(self, sample: Sample) -> None:
+    def _receive(self, sample: Sample) -> None:
         path = self._keys.path(sample.key)
         topic = topics.find(path)
-        if topic is not None:
-            self._receive(path, topic, sample)
-
-    def _receive(self, path: str, topic: Topic, sample: Sample) -> None:
+        if topic is None:
+            return
         message: FleetMessage | None = read_payload(
             topic.message, sample.payload, self._malformed, arrays=topic is not topics.SCAN
         )

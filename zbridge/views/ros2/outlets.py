@@ -11,7 +11,8 @@ from typing import Any
 from zbridge.bus import Bus, Handle
 from zbridge.errors import EncodeError
 from zbridge.metrics import Metrics
-from zbridge.ros2 import Attachment, Endpoint, Kind, Node, Reliability, RosQoS, Types
+from zbridge.ros2.rmw_zenoh import Attachment, Endpoint, Kind, Node, RosQoS
+from zbridge.ros2.types import Types
 
 
 class RosSide:
@@ -43,8 +44,7 @@ class Outlet:
         self._side = side
         self._gid = endpoint.gid()
         self._numbers = itertools.count(1)
-        best_effort = endpoint.qos.reliability is Reliability.BEST_EFFORT
-        on_listened = partial(listened, self)
+        on_listened, best_effort = partial(listened, self), endpoint.qos.best_effort
         self._publisher = side.bus.frames(endpoint.key, on_listened, best_effort=best_effort, kept=kept)
         self._handles: tuple[Handle, ...] = (side.bus.announce(endpoint.token()), self._publisher)
 

@@ -25,7 +25,8 @@ from zbridge.fleet.messages import (
 from zbridge.fleet.payload import measured_ns
 from zbridge.metrics import Metrics
 from zbridge.protocol.kinematics import Odometry
-from zbridge.ros2 import KEEP_LAST_10, LATCHED, SENSOR_DATA, RosQoS, Types, ros_name
+from zbridge.ros2.rmw_zenoh import KEEP_LAST_10, LATCHED, SENSOR_DATA, RosQoS, ros_name
+from zbridge.ros2.types import Types
 from zbridge.views.ros2.diagnostics import Diagnostic, entries_of
 from zbridge.views.ros2.settings import RobotBody
 from zbridge.views.ros2.shapes import Frames, Shapes, Speeds, header, speeds_of, urdf
@@ -126,10 +127,9 @@ class RosPictures:
         self._motion: Motion | None = None
         self._has_pose = False
         self._reckoning = Reckoning()
-        self._scanner: Scanner | None = None
         self._scan_at_ns: int | None = None
-        self._status: Status | None = None
-        self._control: Control | None = None
+        self._states: dict[type, Any] = {}
+        """The last Scanner, Status and Control."""
         self._positions: dict[str, float] = {}
         self._names: dict[str, str] = {}
 
@@ -157,10 +157,8 @@ class RosPictures:
         if self._body.map_to_odom:
             pairs[self.frames.map, self.frames.odom] = (Pose(0.0, 0.0, 0.0), 0.0)
         yield "tf_static", self._shapes.transforms(pairs, now_ns)
-        yield (
-            "robot_description",
-            self._types.message("std_msgs/msg/String", data=urdf(self.robot, self.frames, self._body)),
-        )
+        description = urdf(self.robot, self.frames, self._body)
+        yield "robot_description", self._types.message("std_msgs/msg/String", data=description)
 
     def make(self, path: str, message: FleetMessage, now_ns: int, wanted: Container[str]) -> Made:
         """Make the messages of the topics ``wanted`` of a fleet message that came on a path."""
@@ -185,17 +183,16 @@ class RosPictures:
                 "hardware_id": self.robot,
                 "values": [{"key": key, "value": value} for key, value in entry.values],
             }
-            for entry in (*entries_of(self.robot, self._status, self._control), *more)
+            for entry in (*entries_of(self.robot, self._states.get(Status), self._states.get(Control)), *more)
         ]
-        fields = {"header": header(now_ns, ""), "status": status}
-        return self._types.nested("diagnostic_msgs/msg/DiagnosticArray", fields)
+        return self._types.message("diagnostic_msgs/msg/DiagnosticArray", header=header(now_ns, ""), status=status)
 
     def _on_scan(self, path: str, scan: Scan, stamp_ns: int, wanted: Container[str]) -> Made:
         before, self._scan_at_ns = self._scan_at_ns, stamp_ns
         period_s = (stamp_ns - before) / 1e9 if before is not None else 0.0
         period_s = period_s if 0.0 < period_s < _LONGEST_PERIOD_S else 0.0
         if "scan" in wanted:
-            yield "scan", self._shapes.laser_scan(scan, self._scanner, stamp_ns, period_s)
+            yield "scan", self._shapes.laser_scan(scan, self._states.get(Scanner), stamp_ns, period_s)
 
     def _on_pose(self, path: str, pose: Pose, stamp_ns: int, wanted: Container[str]) -> Made:
         self._has_pose = True
@@ -233,12 +230,7 @@ class RosPictures:
             yield JOINTS.name, self._shapes.joint_states(self._positions, stamp_ns)
 
     def _on_state(self, path: str, state: Scanner | Status | Control, stamp_ns: int, wanted: Container[str]) -> Made:
-        if isinstance(state, Scanner):
-            self._scanner = state
-        elif isinstance(state, Status):
-            self._status = state
-        else:
-            self._control = state
+        self._states[type(state)] = state
         return iter(())
 
 

@@ -12,7 +12,8 @@ from zbridge.bus.tls.files import own_name
 from zbridge.errors import BusError, ConfigError
 from zbridge.fleet.topics import KeySpace
 from zbridge.metrics import Metrics
-from zbridge.ros2 import ros_name, types_of
+from zbridge.ros2.rmw_zenoh import ros_name
+from zbridge.ros2.types import types_of
 from zbridge.tasks import Tasks
 from zbridge.views.live_robots import ROBOTS, watch_robots
 from zbridge.views.ros2.node import RobotNode

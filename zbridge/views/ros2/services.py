@@ -10,7 +10,7 @@ from typing import Any
 from zbridge.bus import Handle, IncomingQuery
 from zbridge.client import Robot
 from zbridge.errors import BusError, Malformed, NotReady, ProtocolError, Refused, describe
-from zbridge.ros2 import SERVICES, Attachment, Kind, Node, read_attachment
+from zbridge.ros2.rmw_zenoh import SERVICES, Attachment, Kind, Node, read_attachment
 from zbridge.tasks import Tasks
 from zbridge.views.ros2.outlets import RosSide
 
@@ -65,13 +65,11 @@ class Services:
             if len(query.payload) > MOST_BYTES:
                 raise ProtocolError(f"request of {len(query.payload)} bytes exceeds {MOST_BYTES}")
             request = self._read(type_name, query.payload)
-        except ProtocolError as error:
+            if len(self._tasks) >= AT_ONCE:
+                raise NotReady(f"more than {AT_ONCE} calls at the same time")
+        except (ProtocolError, NotReady) as error:
             self._refused.value += 1
-            query.refuse(Malformed(str(error)))
-            return
-        if len(self._tasks) >= AT_ONCE:
-            self._refused.value += 1
-            query.refuse(NotReady(f"more than {AT_ONCE} calls at the same time"))
+            query.refuse(error if isinstance(error, NotReady) else Malformed(str(error)))
             return
         self._tasks.start(self._carry_out(type_name, work, request, attachment, query))
 

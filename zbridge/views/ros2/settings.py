@@ -10,7 +10,7 @@ import msgspec
 from zbridge.bus import BusSettings
 from zbridge.errors import ConfigError
 from zbridge.fleet.topics import is_name
-from zbridge.ros2 import DISTROS
+from zbridge.ros2.types import DISTROS
 
 ROS_ROUTER = "tcp/localhost:7447"
 """Where ``ros2 run rmw_zenoh_cpp rmw_zenohd`` listens."""

@@ -17,7 +17,8 @@ import msgspec
 import numpy as np
 
 from zbridge.fleet.messages import Battery, Image, Map, Motion, Pose, Reading, Scan, Scanner
-from zbridge.ros2 import Types, ros_name
+from zbridge.ros2.rmw_zenoh import ros_name
+from zbridge.ros2.types import Types
 from zbridge.views.ros2.settings import RobotBody
 
 POSITION_VARIANCE = 0.05**2
@@ -120,7 +121,7 @@ class Shapes:
 
     def __init__(self, types: Types, frames: Frames) -> None:
         self._types = types
-        self._make = types.nested
+        self._make = types.message
         self.frames = frames
         self._template = cache(self._make_template)
         name = frames.laser.encode() + b"\0"
@@ -128,8 +129,11 @@ class Shapes:
         self._before_ranges = struct.Struct(f"<4siII{len(name)}s{-len(name) % 4}x7fI")
 
     def _make_template(self, form: _Form, count: int) -> MessageTemplate:
-        types, frames = self._types, self.frames
-        return MessageTemplate(lambda *values: types.encode(types.nested(*form(frames, *values))), count)
+        def write(*values: Any) -> bytes:
+            type_name, fields = form(self.frames, *values)
+            return self._types.encode(self._make(type_name, **fields))
+
+        return MessageTemplate(write, count)
 
     def laser_scan(self, scan: Scan, scanner: Scanner | None, stamp_ns: int, period_s: float) -> bytes | None:
         """Write a LaserScan: as many ranges as its angles say, counter-clockwise. period_s: between two scans, or 0.
@@ -160,9 +164,8 @@ class Shapes:
         """Write an Odometry. pose: in the frame odom, None: unknown; spread: its variances are so many times larger."""
         if pose is not None and not _is_finite(pose):
             return None
-        position, heading = (UNMEASURED, UNMEASURED)
-        if pose is not None:
-            position, heading = POSITION_VARIANCE * spread, HEADING_VARIANCE * spread
+        position = UNMEASURED if pose is None else POSITION_VARIANCE * spread
+        heading = UNMEASURED if pose is None else HEADING_VARIANCE * spread
         forward = UNMEASURED if speeds.forward_mps is None else SPEED_VARIANCE * speeds.full_mps**2
         turn = UNMEASURED if speeds.turn_radps is None else TURN_VARIANCE
         speed = speeds.forward_mps or 0.0, speeds.turn_radps or 0.0
@@ -182,8 +185,8 @@ class Shapes:
             "height": fleet_map.rows,
             "origin": _pose(*fleet_map.origin, 0.0, 1.0),
         }
-        fields = {"header": header(stamp_ns, self.frames.map), "info": info, "data": _CELLS[cells]}
-        return self._make("nav_msgs/msg/OccupancyGrid", fields)
+        head = header(stamp_ns, self.frames.map)
+        return self._make("nav_msgs/msg/OccupancyGrid", header=head, info=info, data=_CELLS[cells])
 
     def imu(self, motion: Motion, stamp_ns: int) -> bytes | None:
         """Write an Imu of what a motion has of acceleration and gyro; no orientation."""
@@ -197,46 +200,46 @@ class Shapes:
         """Make a BatteryState; NaN is what the robot does not tell."""
         unknown = dict.fromkeys(("temperature", "charge", "capacity", "design_capacity"), math.nan)
         status = _UNKNOWN_STATUS if battery.charging is None else _CHARGING if battery.charging else _DISCHARGING
-        fields = {
-            "header": header(stamp_ns, self.frames.base),
-            "voltage": _or_nan(battery.voltage),
-            "current": _or_nan(battery.current),
-            "percentage": _or_nan(battery.level),
-            "power_supply_status": status,
-            "present": True,
-        }
-        return self._make("sensor_msgs/msg/BatteryState", fields | unknown)
+        return self._make(
+            "sensor_msgs/msg/BatteryState",
+            header=header(stamp_ns, self.frames.base),
+            voltage=_or_nan(battery.voltage),
+            current=_or_nan(battery.current),
+            percentage=_or_nan(battery.level),
+            power_supply_status=status,
+            present=True,
+            **unknown,
+        )
 
     def compressed_image(self, image: Image, stamp_ns: int) -> Any | None:
         """Make a CompressedImage of a picture, its bytes as they are."""
         if not image.data:
             return None
-        data = np.frombuffer(image.data, np.uint8)
-        fields = {"header": header(stamp_ns, self.frames.camera), "format": image.format, "data": data}
-        return self._make("sensor_msgs/msg/CompressedImage", fields)
+        head, data = header(stamp_ns, self.frames.camera), np.frombuffer(image.data, np.uint8)
+        return self._make("sensor_msgs/msg/CompressedImage", header=head, format=image.format, data=data)
 
     def range_of(self, name: str, reading: Reading, stamp_ns: int) -> Any | None:
         """Make a Range of a distance sensor; a fault is NaN."""
-        fields = {
-            "header": header(stamp_ns, self.frames.sensor(name)),
-            "radiation_type": 1,  # infrared, as far as it says what it is
-            "field_of_view": _FIELD_OF_VIEW_RAD,
-            "min_range": _RANGE_MIN_M,
-            "max_range": _RANGE_MAX_M,
-            "range": math.nan if reading.fault else reading.value,
-        }
-        return self._make("sensor_msgs/msg/Range", fields)
+        return self._make(
+            "sensor_msgs/msg/Range",
+            header=header(stamp_ns, self.frames.sensor(name)),
+            radiation_type=1,  # infrared, as far as it says what it is
+            field_of_view=_FIELD_OF_VIEW_RAD,
+            min_range=_RANGE_MIN_M,
+            max_range=_RANGE_MAX_M,
+            range=math.nan if reading.fault else reading.value,
+        )
 
     def joint_states(self, positions: Mapping[str, float], stamp_ns: int) -> Any | None:
         """Make a JointState: rad, or m for a linear joint."""
         numbers = np.array(list(positions.values()), np.float64)
-        fields = {"header": header(stamp_ns, ""), "name": list(positions), "position": numbers}
-        return self._make("sensor_msgs/msg/JointState", fields)
+        head = header(stamp_ns, "")
+        return self._make("sensor_msgs/msg/JointState", header=head, name=list(positions), position=numbers)
 
     def transforms(self, pairs: Mapping[tuple[str, str], tuple[Pose, float]], stamp_ns: int) -> Any:
         """Make a TFMessage: for each frame and its child where the child is, and how high."""
         made = [_transform(pair, stamp_ns, _place(at), height_m) for pair, (at, height_m) in pairs.items()]
-        return self._make("tf2_msgs/msg/TFMessage", {"transforms": made})
+        return self._make("tf2_msgs/msg/TFMessage", transforms=made)
 
     def moved(self, pose: Pose, stamp_ns: int) -> bytes | None:
         """Write the TFMessage of where the robot is."""
@@ -353,6 +356,4 @@ def _is_finite(pose: Pose) -> bool:
 
 
 def _first(value: float) -> Any:
-    covariance = np.zeros(9)
-    covariance[0] = value
-    return covariance
+    return np.array((value, *(0.0,) * 8))

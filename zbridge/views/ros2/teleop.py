@@ -22,7 +22,7 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import Control, Drive
 from zbridge.lease.stick import Stick
 from zbridge.protocol.rate_limit import RateLimit
-from zbridge.ros2 import KEEP_LAST_10, Endpoint, Kind, Node, endpoints_of, read_attachment, read_token
+from zbridge.ros2.rmw_zenoh import KEEP_LAST_10, Endpoint, Kind, Node, endpoints_of, read_attachment, read_token
 from zbridge.views.ros2.cmd_vel import MOST_BYTES, read_twist
 from zbridge.views.ros2.diagnostics import MOST_VALUES, OK, WARN, Diagnostic, cut
 from zbridge.views.ros2.driving import DEADMAN_S, PUBLISHERS, QUIET_S, RULES, Driving
@@ -143,8 +143,7 @@ class Teleop:
         elif self._driving.came(gid, endpoint.node.full_name, now, early=late or now < self._settled_at):
             self._tokens[token] = gid
             if gid not in self._pilots:
-                self._pilots[gid] = self._pilot(gid)
-            self._limits.setdefault(gid, RateLimit(RATE_HZ))
+                self._pilots[gid], self._limits[gid] = self._pilot(gid), RateLimit(RATE_HZ)
             self._known.update(dict.fromkeys(endpoint.gids(), gid))
         else:
             self._counts["publishers_refused"].value += 1
@@ -167,12 +166,10 @@ class Teleop:
         gid = self._tokens.pop(token, None)
         if gid is None:
             return
-        for also in [also for also, known in self._known.items() if known == gid]:
-            del self._known[also]
+        self._known = {also: known for also, known in self._known.items() if known != gid}
         self._limits.pop(gid, None)
         self._driving.gone(gid)
-        pilot = self._pilots.pop(gid, None)
-        if pilot is not None:
+        if (pilot := self._pilots.pop(gid, None)) is not None:
             pilot.release()
 
     def _pilot(self, gid: bytes) -> Pilot:

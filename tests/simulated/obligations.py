@@ -289,7 +289,7 @@ class Obligations:
         driver.do({"do": "unlatch", "fleet": True})
         self._probe.clear()
         self.world.after(2.5, lambda: self._probe.pop("read", None))
-        self.world.after(2.6, lambda: driver.do({"do": "drive", "for": 1.5, "takeover": True}))
+        self.world.after(2.6, lambda: driver.do({"do": "drive", "for": 1.5, "hz": 4.0, "takeover": True}))
 
     def probed(self) -> None:
         """The robot was driven, and rests."""

@@ -73,6 +73,19 @@ async def soon(condition: Callable[[], object]) -> None:
         await asyncio.sleep(recording.PAUSE_S / 5)
 
 
+async def test_what_comes_after_the_end_is_no_loss_and_nothing_is_unsubscribed_where_that_could_hang(
+    tmp_path: Path,
+) -> None:
+    scene = Scene(tmp_path / "a.mcap")
+    async with scene.running():
+        scene.put("fleet/r1/status", STATUS)
+        await soon(lambda: scene.recorder.messages)
+    scene.put("fleet/r1/status", STATUS)
+    assert [key for key, *_ in scene.read()] == ["fleet/r1/status"]
+    assert scene.recorder.losses() == {}
+    assert scene.bus.network.subscribers != []
+
+
 async def test_a_message_is_recorded_as_it_was_published_at_its_stamp(tmp_path: Path) -> None:
     async with Scene(tmp_path / "a.mcap").running() as scene:
         scene.put("fleet/r1/pose", POSE)

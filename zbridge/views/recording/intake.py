@@ -47,6 +47,7 @@ class Intake:
         self._waiting: list[Arrival] = []
         self._bytes = 0
         self._taken = 0
+        self._closed = False
 
     def __repr__(self) -> str:
         return f"<Intake {len(self._waiting)} waiting, {self.dropped.total()} dropped>"
@@ -60,12 +61,19 @@ class Intake:
         """Queue a message of ``size`` bytes, whose payload is read only where there is room for it."""
         size += OVERHEAD_BYTES
         with self._lock:
+            if self._closed:
+                return False
             if self._bytes + size > self._bound:
                 self.dropped.add(key)
                 return False
             self._bytes += size
             self._waiting.append(Arrival(time.time_ns(), key, read_payload(), attachment))
         return True
+
+    def close(self) -> None:
+        """Queue nothing more: what comes from now on belongs to no recording, and is no loss."""
+        with self._lock:
+            self._closed = True
 
     def take(self) -> list[Arrival]:
         """Take all that waits. The messages taken before count as written now."""

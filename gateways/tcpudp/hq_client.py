@@ -26,18 +26,21 @@ _ON_REQUEST = frozenset({packets.ServerSLAMMap.spec.id, packets.ServerPosition.s
 
 
 class TcpUdpClient(RobotRole):
-    """One program: the geometry of the map that it was announced, and the packets that it knows."""
+    """The session with one HQ program, in which the gateway plays the robot, and the packets that the program knows.
+
+    geometry: of the map that the program was announced.
+    """
 
     kept: ClassVar[dict[str, Any]] = {"geometry": Geometry, "_asked": set[int]}
 
     def __init__(
-        self, bounds: Limits, settings: Settings, number: int, options: TcpUdpHqOptions, geometry: Geometry
+        self, limits: Limits, settings: Settings, client_id: int, options: TcpUdpHqOptions, geometry: Geometry
     ) -> None:
         self.geometry = geometry
         super().__init__(
-            bounds,
+            limits,
             settings,
-            number,
+            client_id,
             options.versions,
             block=_without_map_flag(settings) if options.skip_map_flag else None,
             known=options.known,

@@ -55,7 +55,10 @@ class DriveRun:
                 await self._pilot.close()
 
     async def _obey_keys(self) -> bool:
-        """Carry out the pressed keys; False: end. Raises the reason if the lease was not granted, or sending failed."""
+        """Act on the keys pressed so far; return False if one of them was ``x``.
+
+        Raises the error for which the lease was not granted, or a drive was not sent.
+        """
         while not self._keys.empty():
             key, at = self._keys.get_nowait()
             if key == "x":
@@ -63,7 +66,7 @@ class DriveRun:
             if key == " ":
                 await self._stop()
                 continue
-            self._keyboard.press(key, at)
+            self._keyboard.press(key, at)  # Enter too: any other key ends the motion of the one before
             if key in ("\r", "\n"):
                 self._pilot.take()
         if self._failure is not None:

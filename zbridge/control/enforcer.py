@@ -155,11 +155,15 @@ class Enforcer:
         self.settle()
 
     def merge(self, record: LatchRecord) -> None:
-        """Take over what another gateway of this robot knows; a robot that may move by itself is stopped."""
-        known = self.authority.latches.autonomous
+        """Add the latches and releases that another gateway of this robot has recorded.
+
+        If this gateway learns only now that the robot was ever ordered to move by itself, it stops the robot, unless a
+        program drives it.
+        """
+        was_known = self.authority.latches.autonomous
         self.authority.merge(record)
         self.settle()
-        if self.authority.latches.autonomous and not known:
+        if self.authority.latches.autonomous and not was_known:
             self._remind()
             self._save_latches()
             if not self.authority.motion.driven:

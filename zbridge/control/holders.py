@@ -181,11 +181,14 @@ class Holders:
 
 
 def _use_up(kind: str, seq: int, holder: Holder) -> Holder:
-    """Use a proven number up and return its holder; raise Refused if it was used or passed, or the lease has ended."""
+    """Record that a number whose proof was right is used, and return the holder.
+
+    Raises Refused if the number is not above the highest used one, or if the lease has ended.
+    """
     fresh = seq > holder.numbers.get(kind, -1)
     if fresh:
         holder.numbers[kind] = seq
-    if holder.ended is not None:  # who is None if repeated: anybody who overheard it may have sent it
+    if holder.ended is not None:  # a repeated command may be an eavesdropper's copy: then nobody is named
         raise LeaseLost(f"the lease has ended ({holder.ended})", who=holder.who if fresh else None)
     if not fresh:
         raise Malformed("repeated or out of order", Code.OUT_OF_ORDER)

@@ -230,20 +230,28 @@ class Reporter(Observer):
         self._timer = self._loop.call_later(DRIVEN_HEARTBEAT_S if last.driven else HEARTBEAT_S, self._send_heartbeat)
 
     def _deposit(self, *, first: bool = False) -> None:
-        """Deposit what a successor needs if this process dies. first: also that there is nothing."""
+        """Deposit what a successor needs if this process dies, unless the last deposit says the same.
+
+        Where nothing can be deposited (no state, or a socket that was not reported yet), an empty announcement takes
+        back the deposit before. first: announce also if there is nothing to take back.
+        """
         self._deposited_at, parcel = self._loop.time(), _Listed()
         data, missing, why = self._exported(parcel)
-        known = {each: (number, at) for number, _, reported in self._links.values() for at, each in enumerate(reported)}
-        announced = Deposited()
-        sockets = tuple(known[descriptor] for descriptor in parcel.descriptors if descriptor in known)
+        places = {
+            descriptor: (number, place)
+            for number, _, reported in self._links.values()
+            for place, descriptor in enumerate(reported)
+        }
+        announcement = Deposited()
+        sockets = tuple(places[descriptor] for descriptor in parcel.descriptors if descriptor in places)
         if data and sockets and len(sockets) == len(parcel):
             if (data, sockets) == (self._deposited, self._announced.sockets):
                 return
-            announced = Deposited(sockets, self._memory.deposit(data), len(data))
-        if (first or announced != self._announced) and self._channel.send(announced):
-            self._announced, self._deposited = announced, data
-            if announced.sockets:
-                self._memory.commit(announced.area)
+            announcement = Deposited(sockets, self._memory.deposit(data), len(data))
+        if (first or announcement != self._announced) and self._channel.send(announcement):
+            self._announced, self._deposited = announcement, data
+            if announcement.sockets:
+                self._memory.commit(announcement.area)
         self._log_missing(missing, why, logging.INFO if data else logging.WARNING)
 
     def _exported(self, parcel: Parcel) -> tuple[bytes, str, str]:

@@ -41,9 +41,9 @@ ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THRE
 
 
 def installed() -> tuple[bytes, bool]:
-    """Return the stamp of what is installed now, and whether nothing of it changed for :data:`SETTLED_S`.
+    """Return a stamp of the installed code, and whether the code has been unchanged for :data:`SETTLED_S`.
 
-    Two stamps are equal if no file of the code differs in size and time of change.
+    Two stamps are equal if the same files are installed, each with the same size and time of change.
     """
     digest, newest_ns = hashlib.blake2b(digest_size=16), 0
     for path in _files():

@@ -39,13 +39,14 @@ class RobotSubscription:
     def __repr__(self) -> str:
         return f"<RobotSubscription of {self.keys.robot}, {sorted(self._followers)}>"
 
-    def follow(self, paths: Iterable[str], follower: Follow, gateway: Callable[[bool], None]) -> None:
-        """Call ``follower`` for each message on these paths, ``gateway`` now and when a gateway comes or goes.
+    def follow(self, paths: Iterable[str], follower: Follow, on_gateway: Callable[[bool], None]) -> None:
+        """Call ``follower`` for each message on these paths, and on ``status`` and ``control``.
 
-        ``status`` and ``control`` are always followed.
+        on_gateway: called with whether the robot has a gateway: now, and when one comes or goes. Of a path that others
+        follow already, ``follower`` gets only what comes from now on; :attr:`view` has the last value.
         """
-        self._gateway.append(gateway)
-        gateway(self.view.alive)
+        self._gateway.append(on_gateway)
+        on_gateway(self.view.alive)
         for path in (*_STATES, *paths):
             self.also_follow(path, follower)
 

@@ -70,7 +70,7 @@ class ControlParts(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RobotDevice(Transferable):
-    """One robot on the bus; ``run`` serves it. protocol: the name that ``status`` shows."""
+    """One robot on the bus; ``run`` serves it. protocol: as ``status`` shows it. observer: None: nobody observes."""
 
     def __init__(
         self,
@@ -88,12 +88,12 @@ class RobotDevice(Transferable):
         self._commanded: list[Handle] = []
         self._declared: list[Handle] = []
         self._on_demand: list[OnDemand] = []
-        self._observer = watching = observer or Observer()
+        self._observer = watching = observer or Observer()  # a plain Observer ignores everything
         bus, keys, conditions = context.bus, context.keys, context.conditions
         self._publishers = RobotPublishers(bus, keys, conditions, context.clock, watching.published)
         self._links = links = Links()
         publish = self._publishers.publish
-        self._context = context = msgspec.structs.replace(context, publish=publish, pump=links.pump)
+        self._context = context = msgspec.structs.replace(context, publish=publish, pump=links.pump)  # now complete
         self._pending = pending = PendingQueries(loop)
         self._standstill = Standstill(context, control.authority, control.idle_stop_s)
         self.enforcer = enforcer = Enforcer(

@@ -53,10 +53,11 @@ class Signs(Kept):
         self._asked += questions
 
     def inspect(self, received: int, *, unanswered: bool) -> None:
-        """Judge whether the robot is silent. Call first at :data:`INSPECT_S`; ``unanswered``: a probe got no answer.
+        """Decide whether the robot's silence is a sign. Call at :data:`INSPECT_S` first, then repeatedly.
 
-        Some robots send nothing until they are asked: silence is a sign only if the robot sent telemetry on the
-        connection before, or did not answer the probe.
+        received: packets that are telemetry or answers to queries. unanswered: the probe got no answer. Some robots
+        send nothing until they are asked: silence is a sign only if the robot sent telemetry unasked on an earlier
+        connection, or if it sent nothing at all on this one and did not answer the probe.
         """
         self._note_telemetry(received)
         if not self._inspected:

@@ -85,7 +85,7 @@ def _bus(folder: Folder, roles: Roles, name: str, packing: Packing) -> str:
 
 
 def _routers(folder: Folder, roles: Roles) -> tuple[str, ...]:
-    """Return an endpoint of each router: its first host that other machines reach, else its first."""
+    """Return one endpoint of each router: its first host that is not loopback, else its first; never an IPv6 one."""
     endpoints = []
     for name, member in roles.names.items():
         if member.role == "router":

@@ -150,13 +150,21 @@ class LiveSource(ViewerSource):
     # Work on demand
 
     def _on_wanted(self, channel: ViewerChannel, wanted: bool) -> None:
+        """Subscribe on the bus to what the wanted channels of this robot are drawn from, and to nothing else.
+
+        While ``/<robot>/sensors`` is wanted, one subscription with a wildcard replaces those to single sensors.
+        """
         shown = self._shown.get(channel.topic.split("/")[1])
         if shown is None:
             return
-        (shown.wanted.add if wanted else shown.wanted.discard)(channel.path)
+        if wanted:
+            shown.wanted.add(channel.path)
+        else:
+            shown.wanted.discard(channel.path)
         needed = {source for path in shown.wanted for source in sources_of(shown.offered[path])}
         if _SENSORS in shown.wanted:
-            needed = {source for source in needed - {_SENSORS} if not source.startswith("sensor/")} | {_ALL_SENSORS}
+            single = {source for source in needed if source.startswith("sensor/")}
+            needed = (needed - single - {_SENSORS}) | {_ALL_SENSORS}
         shown.subscribed.need(needed)
 
     def _subscribe(self, shown: _Shown, source: str) -> Handle:

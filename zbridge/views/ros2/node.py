@@ -30,9 +30,9 @@ _FIXED = frozenset(topic.name for topic in TOPICS)
 
 
 class RobotNode:
-    """Declares a robot on ROS's side. bus: the fleet's; own: our name there, if a certificate says one.
+    """Declares one robot on ROS's side. bus: the fleet's. own: the name in our certificate for it; None: we have none.
 
-    drive: whether cmd_vel is subscribed to.
+    drive: whether to subscribe to cmd_vel, and so to drive the robot.
     """
 
     def __init__(
@@ -43,7 +43,7 @@ class RobotNode:
         self._bus = bus
         self._keys = keys
         self._lock = threading.Lock()
-        """Streams come on Zenoh's threads, all else on the event loop's: of the pictures, and of who listens."""
+        """Guards ``_pictures`` and ``_listened``: streams come on Zenoh's threads, all else on the event loop's."""
         self._pictures = RosPictures(keys.robot, side.types, body, side.metrics)
         self._malformed = side.metrics.count("ros2_malformed")
         self.node = side.node(f"/{self._pictures.frames.prefix}", NODE)

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import threading
 from collections.abc import Callable
+from functools import partial
 from typing import Any, TypeVar
 
 import zenoh
@@ -96,7 +97,7 @@ class ZenohBus:
         """The inboxes of all that share the session: urgent input of one is served with that of all."""
         self._inboxes.append(self._inbox)
         self._answers = Answers(session)
-        self._alive = AliveWatches(loop, self._declare_alive)
+        self._alive = AliveWatches(loop, partial(_declare_alive, session, self._inbox))
         self._replies_dropped = metrics.count("bus_replies_dropped")
         self._unanswered = metrics.count("bus_unanswered")
         self._relief: list[Callable[[], None]] = []
@@ -202,27 +203,13 @@ class ZenohBus:
     def watch_alive(self, key_expr: str, handler: Callable[[str, bool], None]) -> Handle:
         return self._keep(self._alive.add(key_expr, handler))
 
-    def _declare_alive(self, key_expr: str, handler: Changed) -> Handle:
-        store = priority_callback(PriorityClass.STOP, self._inbox.source(lambda change: handler(*change), read_change))
-        watch = self._session.liveliness().declare_subscriber(key_expr, threadless(store), history=True)
-        return Declared(watch)
-
     async def flush(self) -> None:
-        await self._flush(self._writer)
+        await _written(self._writer)
 
     async def drain(self, key_expr: str) -> None:
-        await self._flush(self._streams)
+        await _written(self._streams)
         options: Any = {"priority": zenoh.Priority.BACKGROUND, "congestion_control": zenoh.CongestionControl.BLOCK}
         await self._collect(key_expr, lambda handler: self._session.get(key_expr, handler, timeout=1.0, **options), 1.0)
-
-    async def _flush(self, writer: Writer) -> None:
-        written = asyncio.Event()
-        writer.put(lambda: self._loop.call_soon_threadsafe(written.set))
-        try:
-            async with asyncio.timeout(FLUSH_S):
-                await written.wait()
-        except TimeoutError:
-            raise BusError(f"the bus accepted nothing for {FLUSH_S:g} s") from None
 
     def frames(
         self, key: str, listened: Callable[[bool], None], *, best_effort: bool = False, kept: int = 0
@@ -289,3 +276,19 @@ class ZenohBus:
             async with asyncio.timeout(timeout_s + 0.5):  # wait_for of Python 3.11 may lose a cancellation
                 await done.wait()
         return list(replies)
+
+
+async def _written(writer: Writer) -> None:
+    """Wait until all that was queued before is written; raise BusError after :data:`FLUSH_S`."""
+    written, loop = asyncio.Event(), asyncio.get_running_loop()
+    writer.put(lambda: loop.call_soon_threadsafe(written.set))
+    try:
+        async with asyncio.timeout(FLUSH_S):
+            await written.wait()
+    except TimeoutError:
+        raise BusError(f"the bus accepted nothing for {FLUSH_S:g} s") from None
+
+
+def _declare_alive(session: zenoh.Session, inbox: Inbox, key_expr: str, handler: Changed) -> Handle:
+    store = priority_callback(PriorityClass.STOP, inbox.source(lambda change: handler(*change), read_change))
+    return Declared(session.liveliness().declare_subscriber(key_expr, threadless(store), history=True))

@@ -39,7 +39,7 @@ from zbridge.ros2.types import DISTROS, Types, types_of
 from zbridge.simulation.simulator import STEP_S, live
 from zbridge.simulation.world import Body, Grid, cast
 from zbridge.transport import Conversation, ConversationHooks
-from zbridge.transport.samples import serve
+from zbridge.transport.zenoh_link import serve
 
 TIMEOUT_S = 0.5
 """Seconds after which a command counts no more (``cmd_vel_timeout`` of ros2_controllers)."""

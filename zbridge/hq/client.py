@@ -18,7 +18,7 @@ from zbridge.hq.context import ListenerContext
 from zbridge.hq.freeze import FROZEN
 from zbridge.hq.intent import Intent
 from zbridge.hq.operator import Operator
-from zbridge.hq.refusals import RefusalReports
+from zbridge.hq.refusal_reports import RefusalReports
 from zbridge.hq.robot_queries import RobotQueries
 from zbridge.protocol.kept import Exported
 from zbridge.protocol.plugin import Send, Telemetry

@@ -21,7 +21,7 @@ from zbridge.hq.context import Bridge, ListenerContext, listener_counts
 from zbridge.hq.freeze import FROZEN, FreezeWatch
 from zbridge.hq.handover import ListenerHandover
 from zbridge.hq.listener_log import ConnectionLog, FailureLog
-from zbridge.hq.refusals import RefusalReports
+from zbridge.hq.refusal_reports import RefusalReports
 from zbridge.hq.robot_queries import RobotQueries
 from zbridge.hq.robot_subscription import RobotSubscription
 from zbridge.hq.settings import ListenerPlan

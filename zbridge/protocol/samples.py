@@ -1,8 +1,8 @@
 """Frames of a link that is a Zenoh session: what a session declares and puts there, and what it receives. Sans-IO.
 
 A protocol whose robots speak plain Zenoh declares ``Protocol(keyed=True)``. Its sessions then write and read these
-frames where others write and read bytes; :mod:`zbridge.transport.samples` carries them out. Everything else stays as it
-is: outbox, limits, states, taps.
+frames where others write and read bytes; :mod:`zbridge.transport.zenoh_link` carries them out. Everything else stays
+as it is: outbox, limits, states, taps.
 
 =========== ==================================================== ==============================================
 written     SUBSCRIBE, WATCH and ANNOUNCE declare until the      ``key``: an expression; ANNOUNCE: a liveliness

@@ -22,9 +22,9 @@ async def connect(
     if isinstance(address, SerialAddress):
         return serial.connect(address, receiver)
     if isinstance(address, ZenohAddress):
-        from zbridge.transport import samples  # loads what only these links need
+        from zbridge.transport import zenoh_link  # loads what only these links need
 
-        return await samples.connect(address, receiver)
+        return await zenoh_link.connect(address, receiver)
     return await tcp.connect(address, receiver, buffer, kernel)
 
 

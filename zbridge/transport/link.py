@@ -1,7 +1,7 @@
 """A link (one transport connection to a peer) and its receiver, as each kind of them begins. Opens nothing itself.
 
-Links are :class:`~zbridge.transport.tcp.TcpLink`, :class:`~zbridge.transport.serial.SerialLink`,
-:class:`~zbridge.transport.samples.ZenohLink`.
+Links are :class:`~zbridge.transport.tcp.TcpLink`, its form with TLS, :class:`~zbridge.transport.serial.SerialLink`,
+:class:`~zbridge.transport.zenoh_link.ZenohLink`.
 """
 
 from __future__ import annotations

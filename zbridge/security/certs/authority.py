@@ -176,7 +176,7 @@ def _checked_hosts(request: CertificateRequest) -> tuple[str, ...]:
         raise ConfigError(f"--role {request.member.role!r}: expected one of {', '.join(ROLES)}")
     check_member("--robot", request.member)
     hosts = tuple(dict.fromkeys(map(x509.check_host, request.hosts)))
-    if request.member.role == "router" and not any(map(x509.is_reachable, hosts)):
+    if request.member.role == "router" and not any(map(x509.zenoh_accepts, hosts)):
         raise ConfigError(
             f"--host {list(hosts)}: expected every host name and IPv4 address at which clients reach this router"
         )

@@ -90,7 +90,7 @@ def _routers(folder: Folder, roles: Roles) -> tuple[str, ...]:
     for name, member in roles.names.items():
         if member.role == "router":
             _, certificate = load_name(folder, name)
-            hosts = [host for host in x509.hosts_of(certificate) if x509.is_reachable(host)]
+            hosts = [host for host in x509.hosts_of(certificate) if x509.zenoh_accepts(host)]
             hosts.sort(key=is_loopback)
             endpoints += [f"tls/{host}:{PORT}" for host in hosts[:1]]
     if not endpoints:

@@ -95,7 +95,7 @@ def check_host(text: str) -> str:
     return str(address)
 
 
-def is_reachable(host: str) -> bool:
+def zenoh_accepts(host: str) -> bool:
     """Return whether Zenoh can connect to a host by TLS. It treats ``tls/[::1]:7447`` as a name, and rejects it."""
     return ":" not in host
 

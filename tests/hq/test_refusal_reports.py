@@ -15,7 +15,7 @@ from zbridge.errors import Code, NotReady, Refused
 from zbridge.fleet import topics
 from zbridge.fleet.messages import TOLD
 from zbridge.fleet.topics import KeySpace
-from zbridge.hq.refusals import EVERY_S, RefusalReports
+from zbridge.hq.refusal_reports import EVERY_S, RefusalReports
 from zbridge.metrics import Metrics
 from zbridge.tasks import Tasks
 

@@ -12,8 +12,8 @@ from zbridge.errors import LinkError
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import ZenohAddress
 from zbridge.protocol.samples import KeyedSample, SampleKind, read_sample, sample_end, subscription, write_sample
-from zbridge.transport import samples
-from zbridge.transport.samples import DECLARED, ZenohLink
+from zbridge.transport import zenoh_link
+from zbridge.transport.zenoh_link import DECLARED, ZenohLink
 from zbridge.wire.frames import FrameBuffer
 
 
@@ -120,4 +120,4 @@ async def test_a_link_ends_once_with_its_last_connection() -> None:
 
 async def test_a_router_that_is_not_there_is_a_link_error() -> None:
     with pytest.raises(LinkError, match=r"tcp://127\.0\.0\.1:9: "):
-        await samples.connect(ZenohAddress("127.0.0.1", 9), Recorder())
+        await zenoh_link.connect(ZenohAddress("127.0.0.1", 9), Recorder())

@@ -182,7 +182,7 @@ MUTANTS = (
     ),
     Mutant(
         "deadman counts from arrival",
-        "bus",
+        "situations",
         AUTHORITY,
         "return Sender(holder.who, now - late_s, late_s, stale)",
         "return Sender(holder.who, now, late_s, stale)",

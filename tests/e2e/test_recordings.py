@@ -133,7 +133,7 @@ async def test_old_programs_of_every_protocol_see_a_replay_as_the_robot_and_none
         process.stdout.readline()
     async with playing(*(program.judge.run(HOST, ports[program.name]) for program in programs)):
         await soon(lambda: all(program.ready for program in programs), "all connected")
-        await soon(lambda: not [one.name for one in programs if not sees(one, protocol)], "all see the robot")
+        await soon(lambda: not [one.name for one in programs if not sees(one, protocol)], "all see the robot", 30.0)
         await programs[0].drive(0.5)
         await soon(lambda: bench.fleet.refusal("again", code="unsupported"), "the drive refused")
         for program in programs:

@@ -5,6 +5,7 @@ Source: "HQ programs that know of no lease" in ``docs/control.md``. Programs are
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -60,6 +61,8 @@ class Released:
         """By program, when what it sends to its listener was cut off."""
         self._silent: dict[str, float] = {}
         """By program, when its network was back after a silence in which it pushed."""
+        self._gone_at: dict[str, float] = {}
+        """By program, when its connection ended."""
         self._centred: dict[str, float] = {}
         """By program, when what it sends was cut off while its stick was centred."""
         self._waited: dict[str, tuple[float, float]] = {}
@@ -77,8 +80,10 @@ class Released:
                 self._refused.discard(who)
         elif what == "gives mode":
             self._mode[who], self._spoke_at[who] = fields[0], self._world.now
-        elif what == "lost listener" and who == self._only:
-            self._on_gone(who)
+        elif what == "lost listener":
+            self._gone_at[who] = self._world.now
+            if who == self._only:
+                self._on_gone(who)
         elif who == "paths":
             self._on_path(what, fields)
         elif what == "connected to listener":
@@ -113,7 +118,8 @@ class Released:
         """Whether a program that sets a velocity once set this one last, and its machine is connected (``hold``)."""
         cut_s = self._world.now - self._cut_at.get(program.name, self._world.now)
         close = abs(self._checker.said_last(program.name) - motion) < CLOSE
-        return close and program.end is not None and cut_s < most_s
+        gone_s = self._world.now - self._gone_at.get(program.name, -math.inf) if program.end is None else 0.0
+        return close and gone_s < ORDER_S and cut_s < most_s
 
     def waited(self, motion: float, gives: Mapping[str, Iterable[tuple[float, float]]]) -> bool:
         """Whether a program gave this motion while a cut held it up that found its stick centred: docs/hq.md."""

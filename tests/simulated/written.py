@@ -163,7 +163,7 @@ class Written:
 
         def look() -> None:
             kept = any(end.process.name == gateway and self._up(end) for end in self._links())
-            calm = self._ran(gateway, ASIDE_S + 1.0) and self._checker.obligations.calm_since(begun - 1.0)
+            calm = self._ran(gateway, ASIDE_S + 1.0) and self._checker.obligations.calm_since(begun)
             if kept and calm and gateway in self._moves and gateway in self._aside:
                 self._checker.violate("stop-aside", f"{gateway} left the robot to another gateway, and moving")
 

@@ -279,6 +279,13 @@ def _latched_before_the_disk(rng: random.Random, made: Made) -> None:
     made["steps"] += [drive(t, "op1") | {"for": 1.0} for t in (6.5, 8.5, 10.5)]
 
 
+def _killed_listener(rng: random.Random, made: Made) -> None:
+    """The process of a listener is killed while its program drives, and stays away."""
+    gateway = stick(rng, made, alone=True)
+    made["steps"] = [drive(3.5, "stick1") | {"for": 6.0}]
+    made["steps"].append(fault(rng.uniform(5.0, 6.0), "kill", target=gateway["name"]) | {"for": 5.0})
+
+
 FOUND: tuple[Callable[[random.Random, Made], None], ...] = (
     _cut_when_granted,
     _cut_when_granted,
@@ -306,4 +313,5 @@ FOUND: tuple[Callable[[random.Random, Made], None], ...] = (
     _one_wheel_is_let_go,
     _one_wheel_pushed,
     _latched_before_the_disk,
+    _killed_listener,
 )

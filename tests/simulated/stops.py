@@ -10,7 +10,7 @@ import math
 from collections import defaultdict
 from typing import TYPE_CHECKING, Any
 
-from tests.simulated.accounts import Command, read
+from tests.simulated.accounts import Command, Grant, read
 from tests.simulated.written import stops
 
 if TYPE_CHECKING:
@@ -24,6 +24,8 @@ ASKED_S = 5.0
 """Longest time that a program takes to confirm a stop."""
 DEADMAN_LATE_S = 0.12
 """How much later than its deadman a robot is stopped: what a dated command was late by counts."""
+GONE_S = 1.0
+"""Longest time until a lease ends whose process was killed: its token disappears with its connection."""
 SILENCE_S = 2.5
 """Seconds after packet 4 in which a TCP/UDP robot gets nothing but a packet 7."""
 SHOWN_S = 1.0
@@ -63,14 +65,12 @@ class StopRules:
                 self._received.add(stop_id)
         elif what == "receives" and who in self._checker.gateways:
             self._on_command(who)
+        elif what == "killed":
+            self._on_killed(who)
         elif what == "done" and fields[0] in ("stop", "latch"):
             self._on_done(who, fields[0])
         elif what == "puts" and who in self._checker.gateways and fields[0].endswith("/status"):
-            status = read(fields[1])
-            if status.get("state") == "established" and not status.get("stalled"):
-                self._apart_since[who] = math.inf
-            elif self._apart_since.get(who, math.inf) == math.inf:
-                self._apart_since[who] = self._world.now
+            self._on_status(who, read(fields[1]))
         elif (who, what) == ("robot", "connected"):
             self._starts.pop(self._checker.by_host.get(fields[0][0], ""), None)
         elif (who, what) == ("robot", "starts datagrams"):
@@ -98,6 +98,25 @@ class StopRules:
         """Take what a gateway wrote."""
         if stops(self._checker.protocol, data):
             self._stopped_at[gateway] = self._world.now
+
+    def _on_status(self, gateway: str, status: dict[str, Any]) -> None:
+        if status.get("state") == "established" and not status.get("stalled"):
+            self._apart_since[gateway] = math.inf
+        elif self._apart_since.get(gateway, math.inf) == math.inf:
+            self._apart_since[gateway] = self._world.now
+
+    def _on_killed(self, who: str) -> None:
+        """The lease of a process that was killed ends with its liveliness token."""
+        begun = self._world.now
+
+        def look(grant: Grant) -> None:
+            calm = self._checker.obligations.calm_since(begun + 0.01) and self._world.now - grant.renewed_at < 2.5
+            if grant.ended_at is None and calm:
+                self._checker.violate("silent-loss", f"{grant} stands {GONE_S:g} s after {who} was killed")
+
+        for grant in self._checker.current.values():
+            if grant.asker == who and grant.alive and grant.ended_at is None:
+                self._world.after(GONE_S, lambda grant=grant: look(grant))
 
     def _on_command(self, gateway: str) -> None:
         grant = self._checker.current.get(gateway)

@@ -85,7 +85,7 @@ async def race(*work: Coroutine[Any, Any, object]) -> None:
 async def occurs(event: asyncio.Event, within_s: float | None) -> bool:
     """Wait for an event, so long at most (None: as long as it takes); return whether it is set."""
     with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(within_s):
+        async with asyncio.timeout(within_s):  # wait_for of Python 3.11 may lose a cancellation
             await event.wait()
     return event.is_set()
 

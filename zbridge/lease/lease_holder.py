@@ -14,6 +14,7 @@ from zbridge.errors import BusError
 from zbridge.fleet.messages import Control, Refusal
 from zbridge.lease.lease_client import LeaseClient, Question
 from zbridge.lease.lease_events import LeaseEvent, LeaseState
+from zbridge.tasks import occurs
 
 
 class LeaseHolder:
@@ -101,9 +102,7 @@ class LeaseHolder:
         """Do what is due when it is due, until cancelled."""
         while True:
             deadline = self.client.deadline()
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(None if deadline is None else max(0.0, deadline - self._clock())):
-                    await self._changed.wait()
+            await occurs(self._changed, None if deadline is None else max(0.0, deadline - self._clock()))
             self.expire()
             self._changed.clear()
 

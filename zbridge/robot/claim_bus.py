@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 from collections.abc import Callable, Mapping
 
 from zbridge.bus import Bus, Handle, IncomingQuery
 from zbridge.control.latch import LatchRecord
 from zbridge.fleet.topics import KeySpace
 from zbridge.robot.claim import CLAIM, Claim, ClaimQuestion, best_claims, read_question, write
+from zbridge.tasks import occurs
 
 SETTLE_S = 0.25
 """Longest wait for the first connection of the bus."""
@@ -27,8 +27,8 @@ _WHO = "gateway"
 class ClaimBus:
     """The claims of the gateways of one robot. chance: 0 to 1.
 
-    claim: returns the own claim; record: what this gateway knows of the robot. merge: is told what gateways that ask
-    know.
+    claim: returns the own claim; record: what this gateway knows of the robot. merge: is called with what gateways that
+    ask know.
     """
 
     def __init__(
@@ -71,9 +71,7 @@ class ClaimBus:
         """Wait for the first connection, for :data:`SETTLE_S` at most."""
         if self._watch is None:
             self._watch = self._bus.watch_connected(self._on_connected)
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(SETTLE_S):
-                await self._connected.wait()
+        await occurs(self._connected, SETTLE_S)
 
     async def next_look(self, closely: Callable[[], bool]) -> None:
         """Wait until it is time to look for others. closely: whether every :data:`CLOSE_S`."""

@@ -101,8 +101,8 @@ class OwnershipInput(StrEnum):
 class Ownership:
     """The right to be a robot's gateway, from :meth:`take` to :meth:`release` or the end of :meth:`watch`.
 
-    mirror: is told the latched stops of the gateway that owns the robot while this one does not. record: what this
-    gateway knows of the robot. chance: 0 to 1.
+    mirror: is called with the latched stops of the gateway that owns the robot while this one does not. record: what
+    this gateway knows of the robot. chance: 0 to 1.
     """
 
     def __init__(

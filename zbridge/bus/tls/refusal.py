@@ -21,6 +21,7 @@ from zbridge.bus.interface import BusSettings, Tls
 from zbridge.bus.tls.certificate import Certificate
 from zbridge.bus.tls.files import client_context, out_of_date, own_certificate, unusable, utc_now
 from zbridge.errors import ConfigError
+from zbridge.tasks import occurs
 
 LONGEST_S = 3.0
 """Longest time to find the cause, seconds."""
@@ -206,7 +207,5 @@ async def _on_thread(
             loop.call_soon_threadsafe(done.set)
 
     threading.Thread(target=run, name="zbridge-why-not", daemon=True).start()
-    with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(LONGEST_S + 0.5):
-            await done.wait()
+    await occurs(done, LONGEST_S + 0.5)
     return found[0] if done.is_set() and found else None

@@ -38,6 +38,7 @@ from zbridge.bus.zenoh.publishers import Publishers
 from zbridge.errors import BusError
 from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
+from zbridge.tasks import occurs
 
 H = TypeVar("H", bound=Handle)
 
@@ -272,9 +273,7 @@ class ZenohBus:
             await asyncio.to_thread(start, handler)
         except zenoh.ZError as error:
             raise BusError(in_short(error)) from error
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(timeout_s + 0.5):  # wait_for of Python 3.11 may lose a cancellation
-                await done.wait()
+        await occurs(done, timeout_s + 0.5)
         return list(replies)
 
 

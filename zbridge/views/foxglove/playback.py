@@ -9,7 +9,6 @@ index: it is read from its begin, up to the cut.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import itertools
 import logging
 from collections.abc import Iterable, Iterator
@@ -20,6 +19,7 @@ import msgspec
 from mcap.reader import NonSeekingReader, SeekingReader
 
 from zbridge.errors import ZbridgeError, describe
+from zbridge.tasks import occurs
 from zbridge.views.foxglove import replies
 from zbridge.views.foxglove.hub import Hub, Subscriber
 from zbridge.views.foxglove.replies import PlaybackStatus
@@ -244,9 +244,7 @@ class Playback(ViewerSource):
             wait_s = TICK_S
             if ahead:
                 wait_s = max(0.0, min(TICK_S, self._clock.wait_s(ahead[-1].log_ns, self._loop.time())))
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(wait_s):
-                await self._changed.wait()
+        await occurs(self._changed, wait_s)
 
     def _send_time(self, *, ended: bool) -> None:
         now_ns = self._now_ns()

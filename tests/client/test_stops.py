@@ -77,6 +77,23 @@ async def test_a_robot_that_the_stop_of_all_did_not_reach_is_latched_by_name_and
     assert [gateway.control.state for gateway in world.gateways.values()] == ["stopped", "stopped"]
 
 
+async def test_a_stop_whose_gateway_leaves_once_it_has_confirmed_it_is_not_reported_as_done() -> None:
+    world = World("r1")
+    gateway = world.gateways["r1"]
+
+    class LeavesThen(FakeBus):
+        """Its gateway is gone when the status is asked for."""
+
+        async def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> Any:
+            if key_expr.endswith("/status"):
+                await gateway.vanish()
+            return await super().ask(key_expr, payload, timeout_s=timeout_s)
+
+    with pytest.raises(NotReady, match=r"^r1: stop accepted, but its gateway has left: nobody knows whether"):
+        await Fleet(LeavesThen("mine", world.bus.network))["r1"].stop()
+    assert world.machine.stops >= 1
+
+
 async def test_each_robot_has_its_outcome_confirmed_or_not() -> None:
     world = World("r1", "r2", "r3", "r4")
     world.gateways["r2"].publish(topics.STATUS, Status(state="offline", reason="no route"))

@@ -106,6 +106,12 @@ class Grant:
         """Whether its own program asks once more: the grant did not reach it, and it used nothing."""
         return asker == self.asker and self.alive is not None and request.get("alive") == self.alive and not self.used
 
+    def paused(self, now: float) -> None:
+        """Follow a pause of the gateway: a command that came just before may be served after it, and be stale then."""
+        last = self.last_motion
+        if last is not None and last.dated and now - last.received[self.gateway] < CLOSE_S:
+            last.perhaps_stale = True
+
     def received(self, command: Command, now: float) -> None:
         """Follow a command that reached the gateway: when motion must wait for neutral."""
         self.used = True

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 NEW = "+"
 """Behind the name of a gateway's successor, until *go*."""
+PARTS = "+-"
+"""What the names of a successor, and of a process that has handed over, end with."""
 WRITTEN_S = 0.02
 """Seconds that writing a latched stop takes."""
 KNOWN_S = 1.5
@@ -129,7 +131,9 @@ class Checker:
         verb = key.partition("@rpc/control/")[2].partition("/")[0]
         if not verb or error != "None" or gateway not in self.gateways:
             return
-        answer, request = read(payload), self._requests.get((asker, key, asked), {})
+        name = asker.rstrip(PARTS)  # it may have handed over, or died, since it asked
+        answer, requests = read(payload), self._requests
+        request = requests.get((asker, key, asked)) or requests.get((name, key, asked), {})
         self.counts[f"{verb} {'ok' if answer.get('ok', True) else answer.get('code')}"] += 1
         if verb.startswith("unlatch"):
             stop_id = request.get("id", b"")
@@ -154,7 +158,7 @@ class Checker:
 
     def _released(self, grant: Grant, answer: dict[str, Any], asker: str) -> None:
         """Only the holder ends its lease, and may do so."""
-        if answer.get("ok") and asker != grant.asker and grant.ended_at is None:
+        if answer.get("ok") and asker.rstrip(PARTS) != grant.asker.rstrip(PARTS) and grant.ended_at is None:
             self.violate("forged", f"{asker} released {grant}")
         elif not answer.get("ok") and answer.get("code") == "malformed" and asker == grant.asker:
             self.violate("forged", f"{asker} may not release {grant}: {answer.get('reason')}")
@@ -226,6 +230,9 @@ class Checker:
 
     def _on_paused(self, who: str) -> None:
         self._paused_at[who] = self.world.now
+        grant = self.current.get(who)
+        if grant is not None:
+            grant.paused(self.world.now)
 
     def _on_resumed(self, who: str) -> None:
         """A restart that was asked for in a pause ends the lease after it."""

@@ -195,7 +195,8 @@ class RestartRules:
         """A gateway whose successor died keeps the robot, and its connection."""
         ends, _ = self._hello.pop(name, ([], {}))
         ends, begun, calm = [end for end in ends if not end.closed], self.world.now, self._untroubled(TROUBLE_S)
-        if not ends or not calm:
+        leaves = self.checker.gateways[name].session.link.locked  # it joins the bus anew, and connects again
+        if not ends or not calm or leaves:
             return
 
         def look() -> None:

@@ -11,14 +11,15 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
-from collections.abc import Awaitable, Callable, Iterable
+from collections import Counter
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from typing import TypeVar
 
 import msgspec
 
 from zbridge.bus import Bus, Sample
-from zbridge.bus.tls.membership import Right, lacking
-from zbridge.errors import BusError, BusRefused, NotReady, PayloadError, Refused, refusal
+from zbridge.bus.tls.membership import Right, no_answer, require_right
+from zbridge.errors import BusError, NotReady, PayloadError, Refused, refusal
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, Latch, Refusal, Status, Stop, Unlatch
@@ -29,12 +30,13 @@ REPEAT_S = 0.25
 CONFIRM_S = 3.0
 """Longest wait for the confirmation of a stop."""
 ANSWER_S = 2.0
-"""Longest wait for the answer to a release."""
+"""Longest wait for the answer to a release, and for the last value of a state."""
 AT_ONCE = 64
 """Most robots whose confirmations are awaited at a time."""
-_ASK_S = 0.3
 _APART_S = 0.1
 """Seconds after which a gateway does not treat a repeated stop as a repetition."""
+_NAMED = 20
+"""Most robots that a finding names."""
 _WHO, _REASON = 64, 100
 """Characters that fit into a stop, with room for non-ASCII ones."""
 
@@ -72,7 +74,7 @@ async def stop_robot(bus: Bus, keys: KeySpace, stop: Stop) -> None:
     """Stop a robot and return when its gateway has confirmed it.
 
     Raises BusError if no gateway does within CONFIRM_S, Refused if the robot cannot be stopped, NotReady if its gateway
-    has no connection to it, or a stalled one.
+    has no connection to it, or a stalled one, or has left meanwhile.
     """
     await put_stop(bus, keys, stop)  # before anything that may take time
     control = await _shown(bus, keys, stop, lambda control: stop.id in control.stops, CONFIRM_S)
@@ -88,6 +90,8 @@ async def stop_robot(bus: Bus, keys: KeySpace, stop: Stop) -> None:
         status = await _last(bus, keys, topics.STATUS, Status, broken=True)
     except PayloadError as error:
         raise NotReady(f"{keys.robot}: stop accepted, but the robot's status cannot be read: {error}") from error
+    if status is None:
+        raise NotReady(f"{keys.robot}: stop accepted, but its gateway has left: nobody knows whether the robot got it")
     if isinstance(status, Status) and status.state != "established":
         why = status.reason or "no reason known"
         raise NotReady(f"{keys.robot}: stop accepted, but the robot is {status.state}: {why}")
@@ -132,6 +136,24 @@ async def unlatch_fleet(bus: Bus, realm: str, robots: Iterable[str], who: str) -
     return errors | await _each(known, release)
 
 
+def summarize(outcomes: Mapping[str, Outcome], done: str) -> str:
+    """Sum up in one line: ``38 of 40 stopped; r7 offline; r9 did not confirm``."""
+    findings = {name: finding(error) for name, error in outcomes.items() if error is not None}
+    parts = [f"{len(outcomes) - len(findings)} of {len(outcomes)} {done}"]
+    for word, count in Counter(findings.values()).items():
+        names = [name for name, found in findings.items() if found == word]
+        more = f" and {count - _NAMED} more" if count > _NAMED else ""
+        parts.append(f"{', '.join(names[:_NAMED])}{more} {word}")
+    return "; ".join(parts)
+
+
+def finding(error: Exception) -> str:
+    """Return a fixed word for why a stop was not confirmed."""
+    if isinstance(error, NotReady):
+        return "not reached" if isinstance(error, StopWaits) else "offline"
+    return "refused" if isinstance(error, Refused) else "did not confirm"
+
+
 async def _each(robots: Iterable[str], ask: Callable[[str], Awaitable[T]]) -> dict[str, T | Refused | BusError]:
     """Do it for each robot, a limited number at a time; return the result or the error for each."""
     room = asyncio.Semaphore(AT_ONCE)
@@ -148,7 +170,7 @@ async def _each(robots: Iterable[str], ask: Callable[[str], Awaitable[T]]) -> di
 
 
 async def _latches(bus: Bus, keys: KeySpace) -> tuple[Latch, ...]:
-    control = await _last(bus, keys, topics.CONTROL, Control, timeout_s=ANSWER_S)
+    control = await _last(bus, keys, topics.CONTROL, Control)
     if not isinstance(control, Control):
         raise BusError(f"{keys.robot}: no gateway answered within {ANSWER_S:g} s")
     return control.latches
@@ -163,9 +185,8 @@ async def _release(bus: Bus, keys: KeySpace, name: str, stop_id: bytes, *, fleet
         if answer.error is None:
             return
     right = Right.UNLATCH_FLEET if fleet else Right.UNLATCH
-    if lacks := await lacking(bus.ask, keys.realm, name, keys.robot, right):
-        raise BusRefused(f"{keys.robot}: {lacks}")
-    raise BusError(f"{keys.robot}: no gateway answered within {ANSWER_S:g} s")
+    await require_right(bus.ask, keys.realm, name, right, keys.robot)
+    raise BusError(f"{keys.robot}: {no_answer(name, ANSWER_S)}")
 
 
 async def _shown(
@@ -199,12 +220,11 @@ async def _last(
     topic: Topic,
     kind: type[Control] | type[Status],
     *,
-    timeout_s: float = _ASK_S,
     broken: bool = False,
 ) -> Control | Status | None:
     """Return the last value of a state; None if there is none. broken: raise PayloadError if it cannot be decoded."""
     with contextlib.suppress(BusError):
-        for answer in await bus.ask(keys.key(topic.path), timeout_s=timeout_s):
+        for answer in await bus.ask(keys.key(topic.path), timeout_s=ANSWER_S):
             try:
                 if answer.error is None:
                     return payloads.decode(kind, answer.payload)

@@ -151,9 +151,10 @@ class ZenohQuery:
             self._query.drop()  # type: ignore[no-untyped-call]
 
 
-class Replies(list[zenoh.Reply]):
-    """The replies to one query of ours, within bounds; collected on Zenoh's threads.
+class Replies(list[Answer]):
+    """The replies to one query of ours, within bounds; read on Zenoh's threads as they come.
 
+    A reply of Zenoh's keeps the buffer of 64 kB that it came in: those of a fleet of 200 robots took 250 MB.
     A flood of one session's replies must not hide another's. A session that answers for one key sends few replies;
     one that answers for many may answer for a whole fleet.
     """
@@ -169,7 +170,7 @@ class Replies(list[zenoh.Reply]):
         replier = _replier(reply)
         if len(self) < REPLIES and self._counts[replier] < self._of_each:
             self._counts[replier] += 1
-            self.append(reply)
+            self.append(read_reply(reply))
         else:
             self._dropped.value += 1
 

@@ -31,7 +31,6 @@ from zbridge.bus.zenoh.incoming import (
     query_callback,
     rate_limiting,
     read_change,
-    read_reply,
 )
 from zbridge.bus.zenoh.opening import in_short, open_or_explain
 from zbridge.bus.zenoh.publishers import Publishers
@@ -172,7 +171,7 @@ class ZenohBus:
         return self._answers.gather(key_expr)
 
     async def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
-        replies = await self._collect(
+        return await self._collect(
             key_expr,
             lambda handler: self._session.get(
                 key_expr,
@@ -186,7 +185,6 @@ class ZenohBus:
             ),
             timeout_s,
         )
-        return [read_reply(reply) for reply in replies]
 
     def attend(self) -> None:
         for inbox in self._inboxes:
@@ -196,10 +194,12 @@ class ZenohBus:
         return self._keep(Declared(self._session.liveliness().declare_token(key)))
 
     async def alive(self, key_expr: str, *, timeout_s: float = 0.5) -> list[str]:
-        replies = await self._collect(
-            key_expr, lambda handler: self._session.liveliness().get(key_expr, handler, timeout=timeout_s), timeout_s
+        answers = await self._collect(
+            key_expr,
+            lambda handler: self._session.liveliness().get(key_expr, handler, timeout=timeout_s),
+            timeout_s,
         )
-        return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+        return [answer.key for answer in answers if answer.error is None]
 
     def watch_alive(self, key_expr: str, handler: Callable[[str, bool], None]) -> Handle:
         return self._keep(self._alive.add(key_expr, handler))
@@ -210,7 +210,8 @@ class ZenohBus:
     async def drain(self, key_expr: str) -> None:
         await _written(self._streams)
         options: Any = {"priority": zenoh.Priority.BACKGROUND, "congestion_control": zenoh.CongestionControl.BLOCK}
-        await self._collect(key_expr, lambda handler: self._session.get(key_expr, handler, timeout=1.0, **options), 1.0)
+        start = partial(self._session.get, key_expr, timeout=1.0, **options)
+        await self._collect(key_expr, start, 1.0)
 
     def frames(
         self, key: str, listened: Callable[[bool], None], *, best_effort: bool = False, kept: int = 0
@@ -265,7 +266,7 @@ class ZenohBus:
             self._tidy_at = 2 * len(self._handles) + _TIDY
         return handle
 
-    async def _collect(self, key_expr: str, start: Callable[[Any], Any], timeout_s: float) -> list[Any]:
+    async def _collect(self, key_expr: str, start: Callable[[Any], Any], timeout_s: float) -> list[Answer]:
         """Run a get and collect its replies. Zenoh drops the handler after the last reply, which ends the wait."""
         replies, done = Replies(key_expr, self._replies_dropped), asyncio.Event()
         handler = zenoh.handlers.Callback(replies.take, lambda: self._loop.call_soon_threadsafe(done.set))

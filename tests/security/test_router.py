@@ -10,7 +10,7 @@ from tests.access import LAB
 from zbridge.bus import Neighbour, Tls
 from zbridge.errors import Refused
 from zbridge.fleet import payload as payloads
-from zbridge.fleet.messages import Membership
+from zbridge.fleet.processes import Membership
 from zbridge.security.router import FOLD_S, KINDS, Router, ZenohWarnings, translate_log_line
 from zbridge.security.router_settings import RouterPlan, RouterSettings
 
@@ -48,14 +48,14 @@ class Question:
 
 @pytest.fixture
 def router() -> Router:
-    return Router(RouterPlan(RouterSettings(tls=Tls("ca.pem")), LAB))
+    return Router(RouterPlan(RouterSettings(tls=Tls("ca.pem")), LAB), lambda: 12345)
 
 
 @pytest.mark.parametrize(
     ("name", "answers"),
     [
-        ("h1", [Membership(name="h1", role="hq", robots=("r1",))]),
-        ("v1", [Membership(name="v1", role="viewer")]),
+        ("h1", [Membership(name="h1", role="hq", robots=("r1",), stamp_ns=12345)]),
+        ("v1", [Membership(name="v1", role="viewer", stamp_ns=12345)]),
         ("nobody", []),
         ("*", []),
     ],

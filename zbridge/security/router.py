@@ -17,7 +17,7 @@ from zbridge.bus import IncomingQuery, Neighbour, open_router
 from zbridge.errors import BusError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Membership
+from zbridge.fleet.processes import Membership
 from zbridge.metrics import Metrics
 from zbridge.security.router_settings import RouterPlan, zenoh_values
 from zbridge.toml import prefixed
@@ -31,10 +31,11 @@ KINDS = 64
 
 
 class Router:
-    """A router, from its plan to its end."""
+    """A router, from its plan to its end. clock_ns: Unix time."""
 
-    def __init__(self, plan: RouterPlan) -> None:
+    def __init__(self, plan: RouterPlan, clock_ns: Callable[[], int] = time.time_ns) -> None:
         self._plan = plan
+        self._clock_ns = clock_ns
         self._known = {plan.roles.common_name(name) for name in plan.roles.names}
 
     def __repr__(self) -> str:
@@ -73,7 +74,8 @@ class Router:
         name = query.asked.rpartition("/")[2]
         member = self._plan.roles.names.get(name)
         if member is not None:
-            query.answer(payloads.encode(Membership(name=name, role=member.role, robots=member.robots)))
+            known = Membership(name=name, role=member.role, robots=member.robots, stamp_ns=self._clock_ns())
+            query.answer(payloads.encode(known))
 
     def _summary(self) -> str:
         if self._plan.settings.tls is None:
@@ -110,8 +112,8 @@ class ZenohWarnings:
 def translate_log_line(line: str) -> tuple[int, str]:
     """Return the level and the text of one line of Zenoh's log."""
     for pattern, text in _WORDS:
-        if re.search(pattern, line):
-            return logging.WARNING, text
+        if (found := re.search(pattern, line)) is not None:
+            return logging.WARNING, found.expand(text)
     match = _LINE.match(line)
     if match is None or _LOGGED_ELSEWHERE in line:
         return logging.DEBUG, line
@@ -126,6 +128,10 @@ _LOGGED_ELSEWHERE = "Unable to open listener"
 _REFUSED = "refused a connection:"
 _RENEW = "its certificate has expired (zbridge certs renew)"
 _WORDS = (
+    (
+        r"Max transports reached \((\d+)\). Denying new transport with peer: (\w+)",
+        rf"{_REFUSED} all limits.sessions = \1 are used (session \2)",
+    ),
     ("remote certificate chain expired", f"closed a connection: {_RENEW}"),
     ("certificate expired", f"{_REFUSED} {_RENEW}, or a clock is wrong"),
     ("not valid yet", f"{_REFUSED} its certificate is not valid yet: the clock of one machine is wrong"),

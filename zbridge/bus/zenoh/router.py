@@ -20,8 +20,12 @@ from zbridge.bus.zenoh.opening import open_session, write_config
 from zbridge.bus.zenoh.session import ZenohBus
 from zbridge.metrics import Metrics
 
-LOG_LEVEL = "warn"
-"""The part of Zenoh's log that is read, unless the environment variable ``RUST_LOG`` says otherwise."""
+LOG_LEVEL = "warn,zenoh_transport::unicast::manager=trace"
+"""The part of Zenoh's log that is read, unless the environment variable ``RUST_LOG`` says otherwise.
+
+The manager of sessions tells only there that it refuses one because as many as it allows are open; otherwise it has a
+line for each connection that opens.
+"""
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 
 

@@ -337,8 +337,8 @@ PAIRS: list[tuple[type, type]] = [
     (Driver, blocking.Driver),
     (zbridge.client.StateFeed, blocking.StateFeed),
 ]
-INSIDE = {"now", "acquire", "read_control", "release", "statuses"}
-"""What the driver's own context and callbacks use, and the look at how robots are."""
+INSIDE = {"now", "acquire", "read_control", "release", "statuses", "watch"}
+"""What the driver's own context and callbacks use, and the models of health and fleet."""
 
 
 @pytest.mark.parametrize(("awaited", "blocks"), PAIRS, ids=[pair[0].__name__ for pair in PAIRS])

@@ -24,10 +24,22 @@ from tests.proofs import lease
 from zbridge.bus import Answer, Handle, Publisher, Sample
 from zbridge.client import Driver, Fleet, Robot
 from zbridge.client.driver import default_who
-from zbridge.errors import BusError, Code, Held, LeaseLost, Malformed, NeutralFirst, NotReady, Refused, Unsupported
+from zbridge.errors import (
+    BusError,
+    BusRefused,
+    Code,
+    Held,
+    LeaseLost,
+    Malformed,
+    NeutralFirst,
+    NotReady,
+    Refused,
+    Unsupported,
+)
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, Drive, Lease, Mode, Motor, Raw
+from zbridge.fleet.processes import Membership
 from zbridge.fleet.topics import Congestion, Topic
 from zbridge.lease.lease_client import RETRY_S
 
@@ -199,6 +211,29 @@ async def test_with_a_certificate_a_program_asks_in_its_name_and_in_no_other(
         assert [path for _, path in world.gateway.asked] == [f"@rpc/control/{asked}"]
         (token,) = tokens(world.bus)
         assert token == f"operator.op1.{world.bus.zid}"
+
+
+@pytest.mark.parametrize(
+    ("role", "takeover", "told"),
+    [
+        ("viewer", False, "r1: viewer.ann may not drive it: that takes the role operator or supervisor or hq in"),
+        ("operator", True, "r1: operator.ann may not take it over: that takes the role supervisor in"),
+        ("operator", False, "r1: no answer within 5 s: no gateway, or the router's rules forbid it"),
+    ],
+)
+async def test_who_lacks_the_role_is_told_at_once_and_others_that_rules_may_forbid_it(
+    role: str, takeover: bool, told: str
+) -> None:
+    world = World(served=False)
+    member = payloads.encode(Membership(name="ann", role=role))
+    world.bus.answer("fleet/@bus/whoami/ann", lambda question: question.answer(member))
+    began_at, robot = world.loop.time(), Fleet(world.bus.join("ann"), name="ann", clock_ms=raw_ms)["r1"]
+    error = await denied(robot, "ann", takeover=takeover)
+    assert str(error).startswith(told)
+    assert isinstance(error, BusRefused) == ("may not" in told)
+    waited_s = 0.0 if "may not" in told else 5.0
+    assert world.loop.time() - began_at == pytest.approx(waited_s, abs=2 * RETRY_S)
+    world.assert_nothing_is_left()
 
 
 @pytest.mark.parametrize(("wishes", "wait_s"), [({}, 5.0), ({"wait_s": 1.5}, 1.5)])

@@ -126,6 +126,7 @@ class Fleet(_Blocking[fleets.Fleet]):
 
     robots = _waits(fleets.Fleet.robots)
     sessions = _waits(fleets.Fleet.sessions)
+    processes = _waits(fleets.Fleet.processes)
     stop = _waits(fleets.Fleet.stop)
     latch = _waits(fleets.Fleet.latch)
     unlatch = _waits(fleets.Fleet.unlatch)

@@ -10,9 +10,9 @@ from collections.abc import Callable, Coroutine
 from typing import Any
 
 from zbridge.bus import Bus, Sample
-from zbridge.bus.tls.membership import Right, lacking
+from zbridge.bus.tls.membership import Right, no_answer, require_right
 from zbridge.clocks import raw_ms
-from zbridge.errors import BusError, BusRefused, Held, LeaseLost, NeutralFirst, PayloadError, Refused
+from zbridge.errors import BusError, Held, LeaseLost, NeutralFirst, PayloadError, Refused
 from zbridge.errors import refusal as refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -177,9 +177,11 @@ class Driver:
         """Acquire the lease.
 
         Raises Held if another program has it, Malformed for an invalid request; after ``wait_s`` NotReady or
-        RateLimited if the gateway kept refusing so, BusError if none answered; BusRefused if a router knows this
-        program by a role that may not drive.
+        RateLimited if the gateway kept refusing so, BusError if none answered; BusRefused, at once, if a router knows
+        this program by a role that may not drive.
         """
+        right = Right.TAKE_OVER if self._takeover else Right.DRIVE
+        await require_right(self._bus.ask, self._keys.realm, self._name, right, self.robot)
         self._holder.announce()
         with contextlib.suppress(BusError, PayloadError):
             for answer in await self._bus.ask(self._keys.key(topics.CONTROL.path), timeout_s=0.3):
@@ -188,14 +190,7 @@ class Driver:
                     break
         self._spawn(self._holder.keep())
         self._holder.want()
-        try:
-            await self._granted
-        except BusError:
-            right = Right.TAKE_OVER if self._takeover else Right.DRIVE
-            lacks = await lacking(self._bus.ask, self._keys.realm, self._name, self.robot, right)
-            if lacks is not None:
-                raise BusRefused(f"{self.robot}: {lacks}") from None
-            raise
+        await self._granted
 
     def read_control(self, sample: Sample) -> None:
         """Handle news from ``control``: the holder of the lease, and refusals of this program's commands."""
@@ -240,7 +235,7 @@ class Driver:
         """Return the exception for a lease that was not granted."""
         error = event.error
         if event.unanswered or error is None:
-            return BusError(f"{self.robot}: no gateway answered within {self._wait_s:g} s")
+            return BusError(f"{self.robot}: {no_answer(self._name, self._wait_s)}")
         if isinstance(error, Held):
             expires = f", {event.expires_in_s:.1f} s left" if event.expires_in_s is not None else ""
             return Held(f"{self.robot} is {error}{expires}", holder=error.holder)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
 from datetime import UTC, datetime
 
 import pytest
 
 from zbridge.bus import Answer
 from zbridge.bus.tls.certificate import Certificate
-from zbridge.bus.tls.membership import Right, lacking, require_member, router_id
+from zbridge.bus.tls.membership import WHOAMI_S, Right, no_answer, require_member, require_right, router_id
 from zbridge.errors import BusError, BusRefused
 from zbridge.fleet import payload as payloads
-from zbridge.fleet.messages import Membership
+from zbridge.fleet.processes import Membership
 from zbridge.security.access import GRANTS, Keys, MessageKind
 
 NOW = datetime(2026, 11, 22, tzinfo=UTC)
@@ -81,9 +82,38 @@ async def test_the_role_that_a_program_lacks_is_named_as_the_router_knows_it(
         keys.append(key)
         return [answer(member)] if member is not None else []
 
-    name = member.name if member is not None else "ann@here"
-    assert await lacking(ask, "lab", name, "r2", right) == said
-    assert keys == [f"lab/@bus/whoami/{name.replace('@', '%40')}"]
+    name = member.name if member is not None else "ann"
+    if said is None:
+        await require_right(ask, "lab", name, right, "r2")
+    else:
+        with pytest.raises(BusRefused, match=f"^r2: {said}$"):
+            await require_right(ask, "lab", name, right, "r2")
+    assert keys == [f"lab/@bus/whoami/{name}"]
+
+
+async def silent(key: str) -> list[Answer]:
+    await asyncio.sleep(60.0)
+    raise AssertionError(key)
+
+
+@pytest.mark.jumping
+async def test_a_router_that_is_silent_is_waited_for_briefly_and_then_the_certificate_counts() -> None:
+    began = asyncio.get_running_loop().time()
+    await require_right(silent, "lab", "v1", Right.MARK)
+    with pytest.raises(BusRefused, match=r"^viewer\.v1 may not write a mark: that takes the role operator or"):
+        await require_right(silent, "lab", "v1", Right.MARK, role="viewer")
+    await require_right(silent, "lab", "op1", Right.MARK, role="operator")
+    assert asyncio.get_running_loop().time() - began == pytest.approx(3 * WHOAMI_S, abs=0.01)
+
+
+async def test_nobody_is_asked_about_a_name_that_no_certificate_has() -> None:
+    await require_right(silent, "lab", "ann@here", Right.DRIVE, "r2", role="viewer")
+
+
+def test_who_had_no_answer_is_told_of_rules_only_if_they_may_concern_it() -> None:
+    assert no_answer("ann@here", 5.0) == "no gateway answered within 5 s"
+    assert no_answer("ann", 5.0) == "no answer within 5 s: no gateway, or the router's rules forbid it"
+    assert no_answer("ann") == "no answer: no gateway, or the router's rules forbid it"
 
 
 @pytest.mark.parametrize(
@@ -92,6 +122,7 @@ async def test_the_role_that_a_program_lacks_is_named_as_the_router_knows_it(
         (Right.DRIVE, Keys.ACQUIRE),
         (Right.TAKE_OVER, Keys.TAKEOVER),
         (Right.RESTART, Keys.RESTART),
+        (Right.MARK, Keys.MARK),
         (Right.UNLATCH, Keys.UNLATCH),
         (Right.UNLATCH_FLEET, Keys.UNLATCH_FLEET),
     ],
@@ -101,7 +132,7 @@ def test_the_rights_are_those_of_the_access_rules(right: Right, keys: Keys) -> N
     granted = {
         column
         for column, grants in GRANTS.items()
-        if any(grant.keys is keys and MessageKind.QUERY in grant.kinds for grant in grants)
+        if any(grant.keys is keys and {MessageKind.QUERY, MessageKind.PUT} & {*grant.kinds} for grant in grants)
     }
     assert set(right.value[1]) == granted - {"gateway with listeners"}
 

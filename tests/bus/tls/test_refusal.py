@@ -17,7 +17,7 @@ from tests.certificates import Authority, openssl
 from zbridge.bus import BusSettings, Tls
 from zbridge.bus.tls import refusal
 from zbridge.bus.tls.files import folder_tls
-from zbridge.bus.tls.refusal import Finding, ask_endpoint, why_not
+from zbridge.bus.tls.refusal import ConnectFault, ask_endpoint, why_not
 
 HOST = "127.0.0.1"
 
@@ -94,7 +94,7 @@ def silent(link: socket.socket) -> None:
     """Take everything and say nothing."""
 
 
-def told(finding: Finding | None, port: int) -> tuple[str, bool] | None:
+def told(finding: ConnectFault | None, port: int) -> tuple[str, bool] | None:
     return None if finding is None else (finding.text.replace(f"{HOST}:{port}", "HUB"), finding.refused)
 
 
@@ -184,7 +184,7 @@ def test_a_router_that_is_not_reached_may_just_be_away(
 ) -> None:
     monkeypatch.setattr(socket, "create_connection", fails_with(error))
     for endpoint in ("tls/[::1]:7447", "tcp/[::1]:7447?rel=0#iface=lo"):
-        assert ask_endpoint(endpoint, None) == Finding(text, refused=False)
+        assert ask_endpoint(endpoint, None) == ConnectFault(text, refused=False)
 
 
 async def test_our_own_files_are_looked_at_first_and_nobody_is_asked_then(lab: Authority, tmp_path: Path) -> None:
@@ -213,18 +213,18 @@ async def test_a_certificate_that_has_expired_is_told(lab: Authority, monkeypatc
     assert found.text.startswith("the certificate of gateway.g1 expired on ")
 
 
-ANSWERS: list[tuple[list[Finding | None], Finding | None]] = [
+ANSWERS: list[tuple[list[ConnectFault | None], ConnectFault | None]] = [
     ([None, None], None),
-    ([None, Finding("nobody listens", refused=False)], Finding("nobody listens", refused=False)),
-    ([Finding("a", refused=False), Finding("b")], Finding("a; b")),
-    ([Finding("a", refused=False)] * 2, Finding("a", refused=False)),
-    ([Finding(str(number)) for number in range(9)], Finding("0; 1; 2; 3")),
+    ([None, ConnectFault("nobody listens", refused=False)], ConnectFault("nobody listens", refused=False)),
+    ([ConnectFault("a", refused=False), ConnectFault("b")], ConnectFault("a; b")),
+    ([ConnectFault("a", refused=False)] * 2, ConnectFault("a", refused=False)),
+    ([ConnectFault(str(number)) for number in range(9)], ConnectFault("0; 1; 2; 3")),
 ]
 
 
 @pytest.mark.parametrize(("found", "said"), ANSWERS)
 async def test_what_several_endpoints_tell_is_one_finding(
-    monkeypatch: pytest.MonkeyPatch, found: list[Finding | None], said: Finding | None
+    monkeypatch: pytest.MonkeyPatch, found: list[ConnectFault | None], said: ConnectFault | None
 ) -> None:
     monkeypatch.setattr(refusal, "ask_endpoint", lambda at, tls: found[int(at.rpartition(":")[2]) - 1])
     endpoints = tuple(f"tcp/hub:{number}" for number in range(1, len(found) + 1))

@@ -36,21 +36,21 @@ _NO_MESSAGE = b"\x16\x03\x03\x04\x00".ljust(2 + 0x0316, b"\xff")
 the beginning of a record of 0x0400 bytes: the server waits for the rest."""
 
 
-class Finding(msgspec.Struct, frozen=True):
+class ConnectFault(msgspec.Struct, frozen=True):
     """Why a router was not reached. refused: retrying soon is useless; otherwise the router may just be away."""
 
     text: str
     refused: bool = True
 
 
-async def why_not(settings: BusSettings, *, ask: bool = True) -> Finding | None:
+async def why_not(settings: BusSettings, *, ask: bool = True) -> ConnectFault | None:
     """Return why none of the endpoints could be connected to; None if nothing is found to be wrong.
 
     ask: connect to them; otherwise only our own files are checked. A silent connection costs a router time.
     """
     local = own_fault(settings.tls)
     if local is not None:
-        return Finding(local)
+        return ConnectFault(local)
     if not ask:
         return None
     endpoints = settings.connect[:_MOST]
@@ -58,7 +58,7 @@ async def why_not(settings: BusSettings, *, ask: bool = True) -> Finding | None:
     found = [each for each in findings if each is not None]
     if not found:
         return None
-    return Finding("; ".join(dict.fromkeys(each.text for each in found)), any(each.refused for each in found))
+    return ConnectFault("; ".join(dict.fromkeys(each.text for each in found)), any(each.refused for each in found))
 
 
 def own_fault(tls: Tls | None) -> str | None:
@@ -72,7 +72,7 @@ def own_fault(tls: Tls | None) -> str | None:
     return unusable(tls) or (out_of_date(certificate, utc_now()) if certificate is not None else None)
 
 
-def ask_endpoint(endpoint: str, tls: Tls | None) -> Finding | None:
+def ask_endpoint(endpoint: str, tls: Tls | None) -> ConnectFault | None:
     """Connect to an endpoint; return why it accepts no connection, None if it seems to."""
     kind, _, address = endpoint.partition("/")
     host, _, port = address.partition("#")[0].partition("?")[0].rpartition(":")
@@ -88,21 +88,23 @@ def ask_endpoint(endpoint: str, tls: Tls | None) -> Finding | None:
         if finding is not None or kind == "tcp":
             return finding
         if _is_plain(host, int(port), deadline):
-            return Finding(f"{at} speaks no TLS: plain TCP (tcp/{at}), or no router at all")
-        return Finding(f"{at} does not answer in TLS: a router with much to do, or no router at all", refused=False)
+            return ConnectFault(f"{at} speaks no TLS: plain TCP (tcp/{at}), or no router at all")
+        return ConnectFault(
+            f"{at} does not answer in TLS: a router with much to do, or no router at all", refused=False
+        )
     except ConnectionRefusedError:
-        return Finding(f"nobody listens at {at}", refused=False)
+        return ConnectFault(f"nobody listens at {at}", refused=False)
     except socket.gaierror:
-        return Finding(f"no host has the name {host}", refused=False)
+        return ConnectFault(f"no host has the name {host}", refused=False)
     except TimeoutError:
-        return Finding(f"{at} does not answer", refused=False)
+        return ConnectFault(f"{at} does not answer", refused=False)
     except OSError as error:
-        return Finding(f"{at} cannot be reached: {error.strerror or error}", refused=False)
+        return ConnectFault(f"{at} cannot be reached: {error.strerror or error}", refused=False)
 
 
 def _shake_hands(
     link: socket.socket, at: str, host: str, tls: Tls | None, kind: str, deadline: float
-) -> Finding | None:
+) -> ConnectFault | None:
     """Shake hands, and return why that failed or led nowhere; None if the endpoint does not answer in TLS."""
     if tls is not None:
         context, certificate = client_context(tls), own_certificate(tls)
@@ -117,16 +119,16 @@ def _shake_hands(
             with contextlib.suppress(TimeoutError):  # nothing comes: the router waits for Zenoh's first message
                 secure.settimeout(min(_left(deadline), 1.0))
                 secure.recv(1)
-            return Finding(f"{at} takes our certificate, but answers nothing", refused=False)
+            return ConnectFault(f"{at} takes our certificate, but answers nothing", refused=False)
     except ssl.SSLCertVerificationError as error:
-        return Finding(_untrusted(error, at, host, tls))
+        return ConnectFault(_untrusted(error, at, host, tls))
     except ssl.SSLError as error:
         reason = error.reason or ""
         if kind == "tcp" and "ALERT" in reason:
             return _tls_there(at)
         if reason in _NO_TLS or isinstance(error, ssl.SSLEOFError):
             return None
-        return Finding(_said_no(reason, at, certificate))
+        return ConnectFault(_said_no(reason, at, certificate))
     except (TimeoutError, ConnectionError):
         return None
 
@@ -145,8 +147,8 @@ def _is_plain(host: str, port: int, deadline: float) -> bool:
     return True
 
 
-def _tls_there(at: str) -> Finding:
-    return Finding(f"{at} speaks TLS: connect to tls/{at} with certificates (--tls FOLDER, bus.tls)")
+def _tls_there(at: str) -> ConnectFault:
+    return ConnectFault(f"{at} speaks TLS: connect to tls/{at} with certificates (--tls FOLDER, bus.tls)")
 
 
 def _untrusted(error: ssl.SSLCertVerificationError, at: str, host: str, tls: Tls | None) -> str:
@@ -195,10 +197,10 @@ def _left(deadline: float) -> float:
 
 
 async def _on_thread(
-    work: Callable[[str, Tls | None], Finding | None], endpoint: str, tls: Tls | None
-) -> Finding | None:
+    work: Callable[[str, Tls | None], ConnectFault | None], endpoint: str, tls: Tls | None
+) -> ConnectFault | None:
     """Run a blocking call on a thread that may be abandoned; None if it takes too long, or fails itself."""
-    loop, done, found = asyncio.get_running_loop(), asyncio.Event(), list[Finding | None]()
+    loop, done, found = asyncio.get_running_loop(), asyncio.Event(), list[ConnectFault | None]()
 
     def run() -> None:
         with contextlib.suppress(ConfigError, OSError, ValueError):  # the files have changed meanwhile

@@ -66,6 +66,7 @@ PATHS = (
     "@rpc/sessions/hq.{name}.1",
     "@rpc/sessions/hq.{stranger}.1",
     "@wire/robot/in",
+    "@gateway/stats",
     "@alive/gateway",
     "@alive/operator.{name}.a1.1",
     "@alive/operator.{stranger}.a1.1",

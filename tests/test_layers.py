@@ -48,9 +48,10 @@ OFFENCES = {
         "import gateways.alf.messages",
     ),
     "Only the bus imports zenoh": ("zbridge/client/fleet.py", "import zenoh"),
-    "Only the command line imports typer and rich": ("zbridge/app/config.py", "import rich"),
+    "Only the command line imports typer and rich, and top rich's cells": ("zbridge/app/config.py", "import rich"),
     "Only the certificates import cryptography": ("zbridge/security/roles.py", "import cryptography"),
     "Only the views import what viewers and recordings need": ("zbridge/client/fleet.py", "import foxglove"),
+    "Only the screens of top import textual": ("zbridge/views/top/board.py", "import textual"),
     "Only the format of ROS 2 imports rosbags and xxhash": ("zbridge/client/fleet.py", "import xxhash"),
 }
 

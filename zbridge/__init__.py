@@ -9,11 +9,11 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from zbridge.version import __version__ as __version__
+
 if TYPE_CHECKING:
     from zbridge.client import blocking as blocking
     from zbridge.client import connect as connect
-
-__version__ = "0.1.0"
 
 
 def __getattr__(name: str) -> Any:

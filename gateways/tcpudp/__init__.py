@@ -8,6 +8,7 @@ ones, which share no code with the rest.
 
 from __future__ import annotations
 
+from gateways.tcpudp.advice import ADVICE
 from gateways.tcpudp.hq import TcpUdpHq
 from gateways.tcpudp.messages import codecs
 from gateways.tcpudp.options import NAME, TcpUdpHqOptions, TcpUdpOptions
@@ -100,4 +101,5 @@ PROTOCOL = Protocol(
     template=TEMPLATE,
     codecs=codecs(),
     hq_template=HQ_TEMPLATE,
+    advice=ADVICE,
 )

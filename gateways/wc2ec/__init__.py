@@ -11,8 +11,9 @@ from __future__ import annotations
 from gateways.wc2ec.hq import Wc2EcHq
 from gateways.wc2ec.messages import Wc2EcDialect, codecs
 from gateways.wc2ec.options import Wc2EcHqOptions, Wc2EcOptions
+from gateways.wc2ec.session import NO_DEVICE
 from gateways.wc2ec.translate import NAME, Wc2EcRobot
-from zbridge.protocol import ConfigError, HqSimulation, Protocol, Simulation
+from zbridge.protocol import Advice, ConfigError, HqSimulation, Protocol, Simulation
 
 TEMPLATE = """\
 [device]
@@ -120,4 +121,13 @@ PROTOCOL = Protocol(
     template=TEMPLATE,
     codecs=codecs(),
     hq_template=HQ_TEMPLATE,
+    advice=(
+        Advice(
+            NO_DEVICE,
+            "no_device",
+            "the robot accepts the connection and registers no device: no Webots controller program answers there, or"
+            " one of the other dialect",
+            "start the controller anew (it serves one connection for each start), and check options.dialect",
+        ),
+    ),
 )

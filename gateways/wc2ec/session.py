@@ -22,6 +22,7 @@ from gateways.wc2ec.messages import (
 from zbridge.protocol import EncodeError, Limits, Role, Session, State
 
 HANDSHAKE_S = 5.0
+NO_DEVICE = "no device was registered"
 SETTLE_S = 0.1
 """Seconds after a registration without another one or data: then the registrations are complete."""
 
@@ -67,7 +68,7 @@ class ExternalRole(Wc2EcSession):
             self.establish("", ())
 
     def overdue(self) -> str:
-        return f"connected, but no device was registered within {self.limits.handshake_s:g} s"
+        return f"connected, but {NO_DEVICE} within {self.limits.handshake_s:g} s"
 
     def accept(self, message: Wc2EcMessage, now: float) -> bool:
         if self.state is State.HANDSHAKING:

@@ -77,7 +77,8 @@ async def test_a_gateway_declares_twelve_things_at_most_and_streams_when_they_co
     idle = declared - Counter({entry: declared[entry] for entry in streams})
     assert idle.total() <= MOST, idle
     assert {kind for kind, _ in streams} == {"publisher"}
-    assert {key for kind, key in idle if kind == "queryable"} == {"fleet/r1/*", "fleet/r1/@rpc/**"}
+    queryables = {key for kind, key in idle if kind == "queryable"}
+    assert queryables == {"fleet/r1/*", "fleet/r1/@gateway/*", "fleet/r1/@rpc/**"}
 
 
 def is_stream(entry: tuple[str, str]) -> bool:

@@ -13,9 +13,10 @@ from msgspec import UNSET
 
 from zbridge.errors import PayloadError
 from zbridge.fleet import messages as m
+from zbridge.fleet import processes as p
 from zbridge.fleet.payload import decode, encode, pack, schema, unpack
 
-KINDS = {kind for kind in vars(m).values() if isinstance(kind, type) and issubclass(kind, m.FleetMessage)}
+KINDS = {kind for kind in (vars(m) | vars(p)).values() if isinstance(kind, type) and issubclass(kind, m.FleetMessage)}
 KINDS.remove(m.FleetMessage)
 
 
@@ -31,6 +32,10 @@ OFFLINE_SENT = {"who": None, "command": "drive", "code": "not_ready", "reason": 
 LINK = {"name": "robot", "state": "established", "peer": "tcp://a:1"}
 SESSION = {"name": "ground.2", "peer": "tcp://10.0.0.7:50000", "role": "robot", "state": "established"}
 SESSION |= {"version": "1.1", "counters": {"frames_in": 3}, "left_out": {"servertSLAMMapPart (56)": 7}}
+PROCESS = {"host": "hub", "pid": 7, "version": "0.1.0", "robots": 2, "uptime_s": 3.5, "cpu": 0.25, "late_s": 0.001}
+PROCESS |= {"resident_bytes": 70_000_000, "proportional_bytes": None, "files": 31, "most_files": 1024}
+DESK = {"name": "desk", "protocol": "tcpudp", "address": "tcp://0.0.0.0:11002", "clients": 1, "listening": True}
+DISK = {"use": "audit", "path": "/var/log/r1", "free_bytes": 5}
 SCANNER = {"angle_min": 0.0, "angle_max": 1.0, "angle_increment": 0.5, "time_increment_s": 0.1}
 SCANNER |= {"range_min": 0.2, "range_max": 9.0, "points": 3}
 ACQUIRE = {"who": "hq 1", "priority": 3, "lease_s": 2.0, "deadman_s": 0.5, "alive": "operator.1"}
@@ -87,13 +92,18 @@ PAYLOADS: list[tuple[m.FleetMessage, dict[str, Any]]] = [
     (m.Lease(**HELD), HELD | none("lease token")),
     (m.Refusals((OFFLINE,)), {"refusals": [OFFLINE_SENT]}),
     (
-        m.Membership(name="g1", role="gateway", robots=("r1",)),
+        p.Membership(name="g1", role="gateway", robots=("r1",)),
         {"name": "g1", "role": "gateway", "robots": ["r1"]},
     ),
     (m.Denied("closing", "gateway stopped"), {"code": "closing", "reason": "gateway stopped"}),
     (
-        m.Sessions((m.SessionEntry(**SESSION, features=("udp",)),)),
-        {"sessions": [{**SESSION, "reason": None, "features": ["udp"], "transport": "tcp"}]},
+        p.Sessions((p.SessionEntry(**SESSION, features=("udp",)),)),
+        {"sessions": [{**SESSION, "reason": None, "features": ["udp"], "transport": "tcp"}], "listeners": []},
+    ),
+    (
+        p.Stats(p.ProcessStats(**PROCESS), {"pose": 20.5}, 1, 2, 3, (p.ListenerStats(**DESK),), (p.DiskSpace(**DISK),)),
+        {"process": PROCESS, "rates": {"pose": 20.5}, "gaps": 1, "refused": 2, "dropped": 3}
+        | {"listeners": [DESK], "disks": [DISK]},
     ),
 ]
 

@@ -14,7 +14,7 @@ from zbridge.app.handover import channel as handover
 from zbridge.control.admission import is_stop
 from zbridge.control.latch import STOPS, Latches, LatchRecord, read_stop
 from zbridge.errors import LinkError, Malformed, PayloadError, ProtocolError, Unsupported
-from zbridge.fleet import messages, payload, topics
+from zbridge.fleet import messages, payload, processes, topics
 from zbridge.fleet.messages import Authorization, FleetMessage, Stop
 from zbridge.fleet.payload import with_stamp
 from zbridge.host import fd_channel as supervisor
@@ -32,7 +32,11 @@ from zbridge.views.ros2.cmd_vel import read_twist as read_cdr_twist
 from zbridge.views.ros2.settings import RobotBody
 
 KINDS = sorted(
-    (kind for kind in vars(messages).values() if isinstance(kind, type) and issubclass(kind, FleetMessage)),
+    {
+        kind
+        for kind in (*vars(messages).values(), *vars(processes).values())
+        if isinstance(kind, type) and issubclass(kind, FleetMessage)
+    },
     key=lambda kind: kind.__name__,
 )
 ROS_TYPES = (

@@ -64,7 +64,8 @@ def test_expressions_are_of_the_realm_the_name_and_the_robots() -> None:
         "lab/r1/@alive/hq.h1.$*",
         "lab/r2/@alive/hq.h1.$*",
     )
-    assert granted("v1", Member("viewer"), "lab")[MessageKind.SUBSCRIBE, MessageKind.QUERY] == ("lab/**",)
+    of_viewer = granted("v1", Member("viewer"), "lab")
+    assert of_viewer[MessageKind.SUBSCRIBE, MessageKind.QUERY] == ("lab/**", "lab/*/@gateway/*")
 
 
 def test_zenoh_takes_the_rules() -> None:

@@ -22,8 +22,10 @@ from tests.simulated.net import Network
 from tests.simulated.sockets import SimKernel
 from zbridge.app.config import GatewayPlan, plan
 from zbridge.app.gateway import Gateway
+from zbridge.app.process_usage import ProcessUsage
 from zbridge.app.runtime import Runtime
-from zbridge.errors import ZbridgeError
+from zbridge.errors import LinkError, ZbridgeError
+from zbridge.fleet.processes import DiskSpace, ProcessStats
 from zbridge.metrics import Metrics
 
 NEW, OLD = "+", "-"
@@ -33,6 +35,16 @@ OPEN_S = 0.05
 """Seconds that a session takes to connect."""
 AGAIN_S = 1.0
 """Seconds until a process that ended with an error is started again."""
+
+
+class SimUsage(ProcessUsage):
+    """The same numbers always."""
+
+    def read(self) -> ProcessStats:
+        return ProcessStats(host="sim", pid=1, version="0", robots=self.robots)
+
+    def free(self, robot: str) -> tuple[DiskSpace, ...]:
+        return ()
 
 
 class Life:
@@ -144,6 +156,15 @@ class GatewayMember(Member):
                 self.host.world.note(process.name, "ended")
                 process.after(1e-3, lambda: self._exit(life))
 
+    def _look(self, task: asyncio.Task[None]) -> None:
+        """Start again where a process that has handed over, and is frozen, still has the ports of the listeners."""
+        error = None if task.cancelled() else task.exception()
+        if isinstance(error, LinkError) and self._before is not None and self._before.process.paused:
+            self.host.world.note(self.process.name, "finds its ports taken", str(error))
+            self.host.world.after(AGAIN_S, self.start)
+            return
+        super()._look(task)
+
     def _ended(self, life: Life, task: asyncio.Task[None]) -> None:
         """Judge the end of a successor: it may end with an error before it has the robot."""
         gateway = life.gateway
@@ -197,4 +218,5 @@ class GatewayMember(Member):
             processes=SimProcesses(process),
             join=join,
             can_connect=can_connect,
+            usage=SimUsage(),
         )

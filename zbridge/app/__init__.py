@@ -5,7 +5,17 @@ Combines the packages below. Knows no protocol (entry points find them), no term
 
 from zbridge.app.config import GatewayPlan, load, plan
 from zbridge.app.gateway import Gateway
-from zbridge.app.templates import listener_template, robot_template
+from zbridge.app.templates import addressed, listener_template, robot_template, secured
 from zbridge.tasks import until_signal
 
-__all__ = ["Gateway", "GatewayPlan", "listener_template", "load", "plan", "robot_template", "until_signal"]
+__all__ = [
+    "Gateway",
+    "GatewayPlan",
+    "addressed",
+    "listener_template",
+    "load",
+    "plan",
+    "robot_template",
+    "secured",
+    "until_signal",
+]

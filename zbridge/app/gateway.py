@@ -24,6 +24,7 @@ from zbridge.app.joining import SessionUseless, watch_certificate, watch_session
 from zbridge.app.prometheus import serve_metrics
 from zbridge.app.runtime import RUNTIME, Runtime, open_audit
 from zbridge.app.serving import SERVED_ELSEWHERE, Begin, Serving
+from zbridge.app.stats import GatewayStats, StatsPublisher, disks_of
 from zbridge.bus import Bus, Handle, IncomingQuery
 from zbridge.bus.tls.files import own_certificate, own_name
 from zbridge.control.audit_log import Audit
@@ -34,7 +35,7 @@ from zbridge.control.motion_limits import MotionLimits
 from zbridge.errors import ZbridgeError, describe
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Sessions
+from zbridge.fleet.processes import Sessions
 from zbridge.fleet.topics import KeySpace
 from zbridge.hq import Listener, RobotSubscription
 from zbridge.hq.names import listener_names, process_name
@@ -110,6 +111,7 @@ class Gateway:
         self._neighbourhood: Neighbourhood | None = None
         self._on_the_bus = False
         self._serving: Serving | None = None
+        self._stats: GatewayStats
 
     def __repr__(self) -> str:
         return f"<Gateway {self._plan.config.robot.name}>"
@@ -153,6 +155,7 @@ class Gateway:
             stack.callback(bus.watch_connected(self._on_bus).close)
             robot = RobotSubscription(bus, self._keys, self.metrics)
             listeners = self._listeners(bus, robot)
+            self._stats = self._read_stats(listeners)
             work: list[Coroutine[Any, Any, None]] = [each.run(self._incoming.part_restored) for each in listeners]
             self.restarts.listeners = [listener.handover for listener in listeners]
             certificate = own_certificate(self._plan.config.bus.tls)
@@ -198,6 +201,12 @@ class Gateway:
             )
             for plan, name, each in zip(plans, names, exported, strict=True)
         ]
+
+    def _read_stats(self, listeners: list[Listener]) -> GatewayStats:
+        runtime, robot = self._runtime, self._keys.robot
+        usage = runtime.usage
+        usage.disks[robot] = disks_of(self._plan, runtime.folder)
+        return GatewayStats(robot, self.metrics, usage, listeners, runtime.clock, runtime.clock_ns)
 
     def missing(self) -> tuple[str, ...]:
         """Return why this gateway cannot serve its robot now: no bus, or the robot is not established."""
@@ -250,7 +259,11 @@ class Gateway:
         """Answer queries for the session table of this process; ``who`` names the process."""
 
         def answer(question: IncomingQuery) -> None:
-            question.answer(payloads.encode(Sessions(self.sessions.snapshots())))
+            table = Sessions(self.sessions.snapshots(), stamp_ns=self._runtime.clock_ns())
+            if who != "gateway":
+                process, listeners = self._stats.process(), self._stats.listeners()
+                table = msgspec.structs.replace(table, process=process, listeners=listeners)
+            question.answer(payloads.encode(table))
 
         return bus.answer(self._keys.key(topics.RPC_SESSIONS(who).path), answer)
 
@@ -265,7 +278,8 @@ class Gateway:
             camera = Camera(self._plan.camera, self._keys, bus, self.metrics, self.conditions).run
 
         def show() -> tuple[Handle, ...]:
-            return (self._show_sessions(bus, "gateway"), self.restarts.answer(bus))
+            stats = StatsPublisher(bus, self._keys, self._stats)
+            return (self._show_sessions(bus, "gateway"), self.restarts.answer(bus), stats)
 
         self._serving = Serving(
             self._keys.robot, device, ownership, store, self.conditions, show, camera, self._runtime.clock

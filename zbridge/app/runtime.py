@@ -17,6 +17,7 @@ from pathlib import Path
 from zbridge.app.config import GatewayPlan
 from zbridge.app.handover.processes import PROCESSES, Processes
 from zbridge.app.joining import can_connect, join_bus
+from zbridge.app.process_usage import USAGE, ProcessUsage
 from zbridge.bus import Bus
 from zbridge.clocks import Clocks
 from zbridge.control.audit_log import Audit, AuditFile
@@ -30,7 +31,7 @@ class Runtime(Clocks, frozen=True):
 
     chance: 0 to 1. secret: so many random bytes. folder: where latched stops are kept; None: where
     :func:`zbridge.control.latch_store.state_folder` says. processes: for a restart. join: opens the bus, however long
-    that takes. can_connect: whether a second session connects to it.
+    that takes. can_connect: whether a second session connects to it. usage: of this process.
     """
 
     chance: Callable[[], float] = random.random
@@ -40,6 +41,7 @@ class Runtime(Clocks, frozen=True):
     processes: Processes = PROCESSES
     join: Callable[[GatewayPlan, Metrics], Awaitable[Bus]] = join_bus
     can_connect: Callable[[GatewayPlan], Awaitable[bool]] = can_connect
+    usage: ProcessUsage = USAGE
 
 
 RUNTIME = Runtime()

@@ -2,7 +2,27 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
+
 from zbridge.protocol.plugin import Protocol
+from zbridge.toml import as_toml
+
+_CONNECT = re.compile(r"^(connect = \[.*?\] *)(#.*)?$", re.MULTILINE)
+
+
+def addressed(template: str, addresses: Sequence[str]) -> str:
+    """Return a robot's template with these addresses as ``device.connect``; comments stay in their column."""
+
+    def write(line: re.Match[str]) -> str:
+        return f"connect = {as_toml(addresses)} ".ljust(len(line[1])) + (line[2] or "")
+
+    return _CONNECT.sub(write, template, count=1)
+
+
+def secured(template: str) -> str:
+    """Return a template whose ``[bus]`` table names the files of a certificate and a router."""
+    return template.replace(BUS_TEMPLATE, SECURE_BUS_TEMPLATE)
 
 
 def robot_template(protocol: Protocol) -> str:
@@ -55,6 +75,16 @@ listen = []
 multicast = true                        # find peers on the local network
 stream = "drop"                         # "block": no loss when the bus is slower than the robot
 # tls = { ... }                         # a secure bus: put the [bus] table of `zbridge certs bundle` here instead
+
+"""
+SECURE_BUS_TEMPLATE = """\
+[bus]
+mode = "client"                         # of a router, which knows this process by its certificate
+connect = ["tls/router.lab:7447"]       # the router, by a host name in its certificate
+multicast = false
+stream = "drop"                         # "block": no loss when the bus is slower than the robot
+# beside this file, as `zbridge certs bundle NAME -o {name}-bus` makes them:
+tls = { ca = "{name}-bus/ca.pem", certificate = "{name}-bus/certificate.pem", key = "{name}-bus/key.pem" }
 
 """
 CAMERA_TEMPLATE = """\

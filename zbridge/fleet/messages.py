@@ -313,14 +313,6 @@ class Query(FleetMessage, frozen=True):
     """A query without fields."""
 
 
-class Membership(FleetMessage, frozen=True):
-    """What a router knows of the member that asks: its name, its role, and the robots that it names."""
-
-    name: str
-    role: str
-    robots: tuple[str, ...] = ()
-
-
 class Acquire(FleetMessage, frozen=True):
     """Ask for the lease of a robot, or take it over.
 
@@ -374,27 +366,3 @@ class Denied(FleetMessage, frozen=True):
 
     code: str
     reason: str
-
-
-class SessionEntry(msgspec.Struct, frozen=True):
-    """One session of the table: with a robot's link (our role: ``hq``) or with an HQ program (our role: ``robot``).
-
-    counters: frames and bytes carried, lost and refused. left_out: counts of what has no form on the other side.
-    """
-
-    name: str
-    peer: str
-    role: str
-    state: str
-    reason: str | None = None
-    version: str | None = None
-    features: tuple[str, ...] = ()
-    transport: str = "tcp"
-    counters: dict[str, int] = {}
-    left_out: dict[str, int] = {}
-
-
-class Sessions(FleetMessage, frozen=True):
-    """The sessions of one process, the live ones first."""
-
-    sessions: tuple[SessionEntry, ...]

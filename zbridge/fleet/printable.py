@@ -24,8 +24,8 @@ def shown(text: object, most: int = LINE) -> str:
 
 
 def as_json(value: Any) -> str:
-    """Return ``value`` as one line of JSON, printable ASCII only, of any length."""
-    return json.dumps(value).replace("\x7f", "\\u007f")
+    """Return ``value`` as one line of JSON, printable ASCII only, of any length; bytes as hex."""
+    return json.dumps(value, default=bytes.hex).replace("\x7f", "\\u007f")
 
 
 def _escaped(character: str) -> str:

@@ -40,6 +40,7 @@ from zbridge.fleet.messages import (
     Text,
     Unlatch,
 )
+from zbridge.fleet.processes import Stats
 
 
 class Delivery(Enum):
@@ -196,6 +197,7 @@ MAP = Topic("map", Map, Delivery.STATE)
 LIDAR = Topic("lidar", Switch, Delivery.STATE)
 CAMERA = Topic("camera", Switch, Delivery.STATE)
 DEVICES = Topic("devices", Devices, Delivery.STATE)
+STATS = Topic("@gateway/stats", Stats, Delivery.STATE)
 
 CMD_DRIVE = Topic("@cmd/drive", Drive, Delivery.COMMAND, SMALL_BYTES)
 CMD_STOP = Topic("@cmd/stop", Stop, Delivery.COMMAND, SMALL_BYTES)

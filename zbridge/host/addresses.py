@@ -168,6 +168,15 @@ def require_free(plan: GatewayPlan) -> None:
             raise refused(plan, other)
 
 
+def serving(plan: GatewayPlan) -> AddressHolder | None:
+    """Return the process of this machine that serves a plan's robot under its name; None if there is none."""
+    if plan.device is None:
+        return None
+    mine = _shortened(f"{plan.config.robot.realm}/{plan.config.robot.name}")
+    found = (holder for form in sorted(forms_of(plan.device)) for holder in holders(form))
+    return next((holder for holder in found if holder.robot == mine), None)
+
+
 def forms_of(device: DevicePlan) -> frozenset[str]:
     """Resolve the addresses of a robot."""
     return frozenset[str]().union(*resolve(device.addresses).values())

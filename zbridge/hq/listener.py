@@ -63,6 +63,7 @@ class Listener:
         self._clocks, self._clock = clocks, clocks.clock
         self.name = name
         self.address = plan.address
+        self.protocol = plan.protocol.name
         self.ready = asyncio.Event()
         """Set when clients are accepted; ``address`` has the port then."""
         self.clients: dict[int, Client] = {}

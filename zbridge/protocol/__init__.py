@@ -8,7 +8,7 @@ plugin          :class:`Protocol`: what an entry point names. :class:`RobotSide`
                 :class:`Outcome`, :data:`Telemetry`, :data:`Translate` and :data:`Send`; :class:`RobotUser`: what a
                 side may do for a client every ``ATTEND_S`` seconds.
                 :class:`Simulation`, :class:`HqSimulation`: how its simulators are started. :class:`Codec`: the
-                messages, for the conformance kit.
+                messages, for the conformance kit. :class:`Advice`: what ``zbridge doctor`` says of a robot.
 session         :class:`Session`: one conversation, in a :class:`Role`, within :class:`Limits`, in a :class:`State`,
                 with its :class:`Traffic`; a :class:`Datagram` is a frame that goes by UDP, and a session with
                 :class:`SourceClaims` says which of them are its peer's.
@@ -57,6 +57,7 @@ from zbridge.protocol.kinematics import Differential, Factors, Odometry, Positiv
 from zbridge.protocol.outbox import LIMIT, Outbox
 from zbridge.protocol.plugin import (
     ATTEND_S,
+    Advice,
     Codec,
     HqSide,
     HqSimulation,
@@ -90,6 +91,7 @@ __all__ = [
     "LIMIT",
     "SAMPLE_BYTES",
     "Address",
+    "Advice",
     "BearingScan",
     "ClientIds",
     "Code",

@@ -9,7 +9,7 @@ import math
 import operator
 import typing
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Coroutine, Iterable
+from collections.abc import Callable, Coroutine, Iterable, Sequence
 from importlib import import_module
 from typing import Any, ClassVar
 
@@ -270,6 +270,18 @@ class Codec(msgspec.Struct, frozen=True):
     messages: tuple[Any, ...]
 
 
+class Advice(msgspec.Struct, frozen=True):
+    """What is wrong with a robot, as its protocol knows it. code: for programs; text, remedy: for people.
+
+    sign: a part of the reason that this protocol's own sessions give for it.
+    """
+
+    sign: str
+    code: str
+    text: str
+    remedy: str
+
+
 class _NoOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pass
 
@@ -306,6 +318,12 @@ class Protocol(msgspec.Struct, frozen=True):
     :mod:`zbridge.protocol.samples`."""
     requires: tuple[str, ...] = ()
     """Modules that its robots need beyond what zbridge itself does; an extra installs them."""
+    advice: tuple[Advice, ...] = ()
+    """What its robots are known to suffer from, for ``zbridge doctor``."""
+
+    def advise(self, reasons: Sequence[str]) -> tuple[Advice, ...]:
+        """Return what is wrong with a robot. reasons: what ``status`` says, and why its last session ended."""
+        return tuple(each for each in self.advice if any(each.sign in reason for reason in reasons))
 
     def device_address(self, text: str) -> DeviceAddress:
         """Read the address of a robot of this protocol; raise LinkError that names what was expected."""

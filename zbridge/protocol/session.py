@@ -24,7 +24,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 import msgspec
 
 from zbridge.errors import EncodeError, ProtocolError, Refused
-from zbridge.fleet.messages import SessionEntry
+from zbridge.fleet.processes import SessionEntry
 from zbridge.protocol.kept import Budget, Exported, Kept
 from zbridge.protocol.outbox import Outbox
 from zbridge.protocol.rate_limit import RateLimit

@@ -7,7 +7,7 @@ import random
 from collections.abc import Callable, Collection
 from typing import Any, ClassVar
 
-from zbridge.fleet.messages import SessionEntry
+from zbridge.fleet.processes import SessionEntry
 from zbridge.protocol.kept import Kept
 from zbridge.protocol.session import Session
 

@@ -17,6 +17,7 @@ from zbridge.errors import ProtocolError, Refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.topics import Delivery, Topic
+from zbridge.metrics import Count
 from zbridge.protocol.plugin import Translate
 from zbridge.protocol.session import Datagram
 from zbridge.robot.connection import Connection, Links
@@ -43,7 +44,8 @@ class Telemetry:
         self._pending = pending
         self._links = links
         self._translators: dict[type, Translate] = {}
-        self._published = context.metrics.count("published")
+        self._published: dict[str, Count] = {}
+        """By path; the paths of a family share a counter."""
         self._untranslatable = context.metrics.count("untranslatable")
         self._unnamed = context.metrics.count("names_dropped")
 
@@ -74,7 +76,7 @@ class Telemetry:
         encode, translators, waiting = payloads.encode, self._translators, self._pending.waiting
         publishers, known = self._publishers, self._publishers.known
         streams: dict[str, list[bytes]] = {}
-        flowing, states = True, 0
+        flowing = True
         for number, message in enumerate(messages, 1):
             if not number % ATTEND_EVERY:
                 self._bus.attend()
@@ -91,17 +93,24 @@ class Telemetry:
                         streams[topic.path] = [payload]
                     else:
                         flowing = publisher.put(payload) and flowing
-                        states += 1
+                        self._count(topic.path, 1)
                     if waiting:
                         self._pending.answer(topic, payload)
             except ProtocolError as error:
                 self._untranslatable.value += 1
                 log.debug("%s: %s", self._context.keys.robot, error)
-        self._published.value += states + sum(map(len, streams.values()))
+        for path, stream in streams.items():
+            self._count(path, len(stream))
         if streams and not publishers.muted:
             flowing = self._bus.put_all([(known[path], stream) for path, stream in streams.items()]) and flowing
         if not flowing:
             self._links.pause_reading()
+
+    def _count(self, path: str, messages: int) -> None:
+        count = self._published.get(path)
+        if count is None:
+            count = self._published[path] = self._context.metrics.count("published", key=path.partition("/")[0])
+        count.value += messages
 
     def _translator(self, kind: type) -> Translate:
         translate = self._translators[kind] = self._context.robot.translator(kind)

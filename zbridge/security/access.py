@@ -73,13 +73,17 @@ class Keys(Enum):
     HQ_REFUSED = ("{robot}/@rpc/control/refused/hq.{name}", "{robot}/@rpc/control/refused/hq.{name}.$*")
     HQ_SESSIONS = ("{robot}/@rpc/sessions/hq.{name}", "{robot}/@rpc/sessions/hq.{name}.$*")
     WIRE = ("{robot}/@wire/**",)
+    STATS = ("{robot}/@gateway/*",)
     ALIVE = ("{robot}/@alive/**",)
     GATEWAY_TOKEN = ("{robot}/@alive/gateway",)
     OPERATOR_TOKEN = ("{robot}/@alive/operator.{name}.$*",)
     HQ_TOKEN = ("{robot}/@alive/hq.{name}.$*",)
     WHOAMI = ("@bus/whoami/{name}",)
     ADMIN = ("@/**",)
-    EVERYTHING = ("**", "**/@cmd/**", "**/@rpc/**", "**/@wire/**", "**/@alive/**", "**/@bus/**", "@mark", "@/**")
+    EVERYTHING = (
+        *("**", "**/@cmd/**", "**/@rpc/**", "**/@wire/**", "**/@alive/**", "**/@gateway/**"),
+        *("**/@bus/**", "@mark", "@/**"),
+    )
 
 
 class Grant(msgspec.Struct, frozen=True):
@@ -99,6 +103,7 @@ _ANSWER = (MessageKind.QUERYABLE, MessageKind.REPLY)
 
 _VIEWER = (
     Grant(Keys.DATA, _LISTEN),
+    Grant(Keys.STATS, _LISTEN),
     Grant(Keys.ALIVE, _SEE),
     Grant(Keys.SESSIONS, (MessageKind.QUERY,)),
     Grant(Keys.STOP, (MessageKind.PUT,)),
@@ -131,6 +136,7 @@ _HQ = (
 )
 _GATEWAY = (
     Grant(Keys.DATA, (MessageKind.PUT, *_ANSWER), own=True),
+    Grant(Keys.STATS, (MessageKind.PUT, *_ANSWER), own=True),
     Grant(Keys.COMMANDS, (MessageKind.SUBSCRIBE,), own=True),
     Grant(Keys.RPC, _ANSWER, own=True),
     Grant(Keys.CLAIM, (MessageKind.QUERY,), own=True),
@@ -142,6 +148,7 @@ _GATEWAY = (
 )
 _RECORDER = (
     Grant(Keys.DATA, _LISTEN),
+    Grant(Keys.STATS, _LISTEN),
     Grant(Keys.COMMANDS, (MessageKind.SUBSCRIBE,)),
     Grant(Keys.MARK, (MessageKind.SUBSCRIBE,)),
     Grant(Keys.WIRE, (MessageKind.SUBSCRIBE,)),

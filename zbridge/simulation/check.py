@@ -17,7 +17,7 @@ from collections.abc import Iterator
 import msgspec
 
 from zbridge.errors import ConfigError
-from zbridge.fleet.messages import SessionEntry
+from zbridge.fleet.processes import SessionEntry
 from zbridge.protocol.plugin import Protocol, find_protocol
 from zbridge.protocol.session import Role
 from zbridge.simulation.check_commands import check_commands, check_stop

@@ -21,6 +21,7 @@ from gateways.tcpudp.messages import (
 from zbridge.protocol import Limits, ProtocolError, Role, Session
 
 HANDSHAKE_S = 5.0
+NO_COMMON_VERSION = "no common version"
 _QUOTED = 80
 
 Decode = Callable[[bytes, int], Packet]
@@ -63,6 +64,6 @@ class PacketSession(Session[Packet]):
 
     def refuse_versions(self, listed: str, ours: Iterable[str], now: float) -> None:
         """Close for lack of a common version, with a text to the peer ("Settings and version negotiation")."""
-        reason = f"no common version: the peer speaks {listed[:_QUOTED]!r}, this gateway {', '.join(ours)}"
+        reason = f"{NO_COMMON_VERSION}: the peer speaks {listed[:_QUOTED]!r}, this gateway {', '.join(ours)}"
         self.send(DebugMessage(reason))
         self.close(reason, now)

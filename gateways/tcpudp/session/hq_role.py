@@ -58,6 +58,8 @@ PROBE_S = 2.0
 SILENCE_S = 2.5
 """Seconds after packet 4 in which only one packet 7 may be sent by TCP: the robot sleeps 2 s, and may be late."""
 LATE_START = "handshaking"
+UNREADABLE = "no settings that can be read"
+USED_UP = "its one connection may be used up"
 MAX_WRITE = 4096
 """Bytes of the longest packet a legacy robot reads whole."""
 AGAIN_S = 0.3
@@ -136,11 +138,8 @@ class HqHandshake(WatchedSession):
 
     def overdue(self) -> str:
         if self.last_malformed is not None:
-            return f"no settings that can be read within {self.limits.handshake_s:g} s: {self.last_malformed}"
-        return (
-            f"connected, but no settings within {self.limits.handshake_s:g} s: "
-            "its one connection may be used up, restart the robot program"
-        )
+            return f"{UNREADABLE} within {self.limits.handshake_s:g} s: {self.last_malformed}"
+        return f"connected, but no settings within {self.limits.handshake_s:g} s: {USED_UP}, restart the robot program"
 
     # Messages of the handshake
 

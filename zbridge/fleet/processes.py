@@ -1,0 +1,102 @@
+"""What processes tell of themselves: a router's members, sessions with peers, what each process does and uses."""
+
+from __future__ import annotations
+
+import msgspec
+from msgspec import UNSET, UnsetType
+
+from zbridge.fleet.messages import FleetMessage
+
+
+class Membership(FleetMessage, frozen=True):
+    """What a router knows of the member that asks: its name, its role, and the robots that it names."""
+
+    name: str
+    role: str
+    robots: tuple[str, ...] = ()
+
+
+class SessionEntry(msgspec.Struct, frozen=True):
+    """One session of the table: with a robot's link (our role: ``hq``) or with an HQ program (our role: ``robot``).
+
+    counters: frames and bytes carried, lost and refused. left_out: counts of what has no form on the other side.
+    """
+
+    name: str
+    peer: str
+    role: str
+    state: str
+    reason: str | None = None
+    version: str | None = None
+    features: tuple[str, ...] = ()
+    transport: str = "tcp"
+    counters: dict[str, int] = {}
+    left_out: dict[str, int] = {}
+
+
+class ProcessStats(msgspec.Struct, frozen=True):
+    """One process, and what it uses of its machine.
+
+    version: of zbridge. robots: how many it serves. uptime_s: seconds since it started. cpu: processors in use, 0.02 is
+    two hundredths of one, over the last seconds. resident_bytes: with all shared pages; proportional_bytes: each shared
+    page divided among those that share it; None where the platform does not say. files: open descriptors, of at most
+    most_files. late_s: by how much the event loop was late in the last second.
+    """
+
+    host: str
+    pid: int
+    version: str
+    robots: int = 1
+    uptime_s: float = 0.0
+    cpu: float = 0.0
+    resident_bytes: int = 0
+    proportional_bytes: int | None = None
+    files: int = 0
+    most_files: int = 0
+    late_s: float = 0.0
+
+
+class ListenerStats(msgspec.Struct, frozen=True):
+    """One listener for HQ programs. name: on the bus, without ``hq.``. listening: whether it accepts connections."""
+
+    name: str
+    protocol: str
+    address: str
+    clients: int = 0
+    listening: bool = True
+
+
+class DiskSpace(msgspec.Struct, frozen=True):
+    """The disk that a file is written to. use: ``audit``, ``latches`` or ``recording``."""
+
+    use: str
+    path: str
+    free_bytes: int
+
+
+class Stats(FleetMessage, frozen=True):
+    """What the gateway of a robot does and uses; once a second.
+
+    rates: messages that it published in the last second, by the first part of the key: ``{"pose": 20.0}``. gaps:
+    messages of the robot that were lost before they reached the gateway, where a sequence shows it. refused: commands;
+    dropped: messages. All three are counted since the process started.
+    """
+
+    process: ProcessStats
+    rates: dict[str, float] = msgspec.field(default_factory=dict)
+    gaps: int = 0
+    refused: int = 0
+    dropped: int = 0
+    listeners: tuple[ListenerStats, ...] = ()
+    disks: tuple[DiskSpace, ...] = ()
+
+
+class Sessions(FleetMessage, frozen=True):
+    """The sessions of one process, the live ones first.
+
+    process, listeners: of a process that serves HQ programs only, which has no :class:`Stats` of its own.
+    """
+
+    sessions: tuple[SessionEntry, ...]
+    process: ProcessStats | UnsetType = UNSET
+    listeners: tuple[ListenerStats, ...] = ()

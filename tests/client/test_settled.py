@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from zbridge.client.fleet import QUERY_AFTER_S, SETTLE_S, settled
+from zbridge.client.settled import QUERY_AFTER_S, SETTLE_S, settled
 
 pytestmark = pytest.mark.jumping
 

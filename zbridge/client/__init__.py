@@ -17,14 +17,14 @@ import contextlib
 from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 
-from zbridge.bus import BusSettings, Tls, open_bus
+from zbridge.bus import Bus, BusSettings, Tls, open_bus
 from zbridge.bus.tls.files import folder_settings, own_name
 from zbridge.client.driver import Driver
 from zbridge.client.feed import Feed, StateFeed
 from zbridge.client.fleet import Fleet, Robot
 from zbridge.metrics import Metrics
 
-__all__ = ["LOCAL_ROUTER", "Driver", "Feed", "Fleet", "Robot", "StateFeed", "bus_settings", "connect"]
+__all__ = ["LOCAL_ROUTER", "Driver", "Feed", "Fleet", "Robot", "StateFeed", "bus_settings", "connect", "joined"]
 
 LOCAL_ROUTER = "tcp/127.0.0.1:7447"
 """The default address of a router on this machine."""
@@ -63,8 +63,15 @@ async def connect(
         endpoints = (endpoints,)
     settings = settings or bus_settings(endpoints, tls)
     name = own_name(settings.tls)
+    async with joined(settings, realm) as bus:
+        yield Fleet(bus, realm, name)
+
+
+@contextlib.asynccontextmanager
+async def joined(settings: BusSettings, realm: str | None) -> AsyncIterator[Bus]:
+    """Open the bus while the context lasts; raise BusError. realm: in which a router must know us; None: any."""
     bus = await open_bus(settings, Metrics(), wait_for_peers=True, realm=realm)
     try:
-        yield Fleet(bus, realm, name)
+        yield bus
     finally:
         await bus.close()

@@ -6,13 +6,15 @@ import asyncio
 import contextlib
 import itertools
 import os
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator
-from typing import Any, TypeVar
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator
+from typing import Any
 
 from zbridge.bus import Bus, Sample
 from zbridge.client import stops
 from zbridge.client.driver import Driver, default_who
 from zbridge.client.feed import WAITING, WAITING_IMAGES, Feed, StateFeed, reader
+from zbridge.client.fleet_model import FleetModel
+from zbridge.client.settled import settled
 from zbridge.client.stops import Outcome
 from zbridge.clocks import raw_ms
 from zbridge.errors import BusError, Malformed, PayloadError, Refused, refusal
@@ -35,20 +37,13 @@ from zbridge.fleet.messages import (
     Scan,
     Scanner,
     SensorSetting,
-    SessionEntry,
-    Sessions,
     Status,
     Switch,
     Text,
 )
+from zbridge.fleet.processes import SessionEntry, Sessions
 from zbridge.fleet.topics import KeySpace, Topic, escape, is_name, split_key, unescape
 
-T = TypeVar("T")
-
-QUERY_AFTER_S = (0.02, 0.1, 0.3, 0.5)
-"""Seconds between two queries for robots; the last one repeats."""
-SETTLE_S = 3.0
-"""Longest time for which robots are queried until two results are the same, seconds."""
 ANSWER_S = 5.0
 """Longest wait for a robot's answer, seconds."""
 _attempts = itertools.count(1)
@@ -120,23 +115,41 @@ class Fleet:
         async for named in Feed(self._bus, f"{self.realm}/{robot or '*'}/{topics.STATUS.path}", read):
             yield named
 
+    @contextlib.asynccontextmanager
+    async def watch(
+        self, changed: Callable[[str], None] = lambda name: None, *, lazy: bool = False
+    ) -> AsyncIterator[FleetModel]:
+        """Follow the state of all robots, without their streams, while the context lasts.
+
+        changed: called with a robot's name after each message of its gateway. lazy: see :class:`FleetModel`.
+        """
+        model = FleetModel(self._bus, self.realm, changed, lazy=lazy)
+        with contextlib.closing(model):
+            model.open()
+            await model.query()
+            yield model
+
     async def sessions(self) -> dict[tuple[str, str], tuple[SessionEntry, ...]]:
         """Return the session tables by robot and process: peers, their states, and what was not translated.
 
         The query is repeated as that of :meth:`robots` is.
         """
-        tables = await settled(self._query_sessions, lambda seen: seen.keys())
-        return dict(sorted(tables.items()))
+        return {process: table.sessions for process, table in (await self.processes()).items()}
 
-    async def _query_sessions(self) -> dict[tuple[str, str], tuple[SessionEntry, ...]]:
-        tables: dict[tuple[str, str], tuple[SessionEntry, ...]] = {}
-        for answer in await self._bus.ask(f"{self.realm}/*/@rpc/sessions/*"):
-            split = split_key(answer.key)
-            if split is not None and answer.error is None:
-                with contextlib.suppress(PayloadError):
-                    who = split[2].rpartition("/")[2]
-                    tables[split[1], who] = payloads.decode(Sessions, answer.payload).sessions
-        return tables
+    async def processes(self, robot: str | None = None) -> dict[tuple[str, str], Sessions]:
+        """Return what the processes of one robot, or of all, say of themselves: sessions, and what listeners use."""
+
+        async def query() -> dict[tuple[str, str], Sessions]:
+            tables: dict[tuple[str, str], Sessions] = {}
+            for answer in await self._bus.ask(f"{self.realm}/{robot or '*'}/@rpc/sessions/*"):
+                split = split_key(answer.key)
+                if split is not None and answer.error is None:
+                    with contextlib.suppress(PayloadError):
+                        tables[split[1], split[2].rpartition("/")[2]] = payloads.decode(Sessions, answer.payload)
+            return tables
+
+        tables = await settled(query, lambda seen: seen.keys())
+        return dict(sorted(tables.items()))
 
     async def stop(self, names: Iterable[str] | None = None, reason: str | None = None) -> dict[str, Outcome]:
         """Stop these robots, or all that have a gateway; return for each the error, None if the stop was confirmed.
@@ -377,21 +390,3 @@ class Robot:
                 raise BusError(f"{self.name}: {answer.error}")
             return payloads.decode(message, answer.payload)
         raise BusError(f"{self.name}: no gateway answered within {ANSWER_S:g} s")
-
-
-async def settled(query: Callable[[], Awaitable[T]], compared: Callable[[T], object]) -> T:
-    """Query until two results in a row are the same, for at most :data:`SETTLE_S` seconds; return the last.
-
-    Results may be partial for a while, for example when many gateways join the bus at once. compared: returns the part
-    of a result that must be the same, or None if the result is known to be partial.
-    """
-    loop = asyncio.get_running_loop()
-    end, found = loop.time() + SETTLE_S, await query()
-    for after_s in itertools.chain(QUERY_AFTER_S, itertools.repeat(QUERY_AFTER_S[-1])):
-        if loop.time() + after_s > end:
-            break
-        await asyncio.sleep(after_s)
-        before, found = compared(found), await query()
-        if before is not None and compared(found) == before:
-            break
-    return found

@@ -9,7 +9,7 @@ from tests.fake_bus import FakeBus
 from tests.views.foxglove.test_hub import Looking, ids
 from zbridge.client import Fleet
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Control, Device, Devices, FleetMessage, Latch, Pose, Reading, Switch
+from zbridge.fleet.messages import Control, Device, Devices, FleetMessage, Latch, Pose, Reading, Status, Switch
 from zbridge.fleet.payload import encode
 from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
@@ -38,7 +38,7 @@ class Scene:
 
     def keys(self) -> list[str]:
         """Give the keys and expressions that are subscribed to, but those of the server itself."""
-        own = ("fleet/*/devices", "fleet/*/control")
+        own = ("fleet/*/devices", "fleet/*/control", "fleet/*/status", "fleet/*/@gateway/stats")
         return sorted(key for key, _ in self.bus.network.subscribers if key not in own)
 
     def put(self, topic: Topic, message: FleetMessage | bytes) -> None:
@@ -144,6 +144,18 @@ async def test_viewers_are_warned_of_a_latched_robot_for_as_long_as_it_is() -> N
     scene.put(topics.CONTROL, Control("latched", latches=(latch,)))
     token.close()
     assert [said for said in later.said if said["op"] == "removeStatus"] == [removed] * 2
+
+
+async def test_viewers_are_warned_of_a_robot_that_is_away_and_why(scene: Scene) -> None:
+    away = {"op": "status", "level": 1, "id": "state.r1", "message": "r1: offline: no route to host"}
+    scene.put(topics.STATUS, Status("established"))
+    scene.put(topics.STATUS, Status("offline", reason="no route to host"))
+    scene.put(topics.STATUS, Status("offline", reason="no route to host"))
+    assert [said for said in scene.viewer.said if said["op"] == "status"] == [away]
+    scene.put(topics.STATUS, Status("established", stalled=True))
+    assert scene.viewer.said[-1] == away | {"message": "r1: the robot's link is stalled"}
+    scene.put(topics.STATUS, Status("established"))
+    assert scene.viewer.said[-1] == {"op": "removeStatus", "statusIds": ["state.r1"]}
 
 
 async def test_parameters_follow_the_robot_while_somebody_watches_them(scene: Scene) -> None:

@@ -14,15 +14,16 @@ from typing import Any
 import msgspec
 
 from zbridge.bus import Bus, Handle, Sample
+from zbridge.client.fleet_model import FleetModel
 from zbridge.errors import BusError
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Control, Devices, FleetMessage, Reading, Switch
+from zbridge.fleet.messages import Devices, FleetMessage, Reading, Switch
 from zbridge.fleet.topics import KeySpace, Topic, split_key, unescape
 from zbridge.metrics import Metrics
 from zbridge.views.foxglove.commands import RobotCommands
 from zbridge.views.foxglove.hub import Hub
 from zbridge.views.foxglove.source import ViewerSource
-from zbridge.views.live_robots import ROBOTS, OnDemandSubscriptions, read_payload, watch_robots
+from zbridge.views.live_robots import ROBOTS, OnDemandSubscriptions, read_payload
 from zbridge.views.pictures import FoxglovePictures, ViewerChannel, channels_of, sources_of
 from zbridge.views.schemas import json_schema
 
@@ -77,6 +78,7 @@ class LiveSource(ViewerSource):
         self._watching: list[Handle] = []
         self._watchers = 0
         self._malformed = metrics.count("foxglove_malformed")
+        self._model = FleetModel(bus, realm, self._on_robot, malformed=self._malformed)
         self._left_out = metrics.count("foxglove_channels_left_out")
         hub.on_wanted = self._on_wanted
 
@@ -85,14 +87,14 @@ class LiveSource(ViewerSource):
 
     def start(self) -> None:
         self._handles = [
-            watch_robots(self._bus, self._realm, self._robots, self._on_gateway),
             self._bus.subscribe(f"{self._realm}/*/{topics.DEVICES.path}", self._on_devices, history=True),
-            self._bus.subscribe(f"{self._realm}/*/{topics.CONTROL.path}", self._on_control, history=True),
         ]
+        self._model.open()
 
     async def close(self) -> None:
         """End all that is held and declared; idempotent."""
         handles, self._handles, self._watching = [*self._handles, *self._watching], [], []
+        self._model.close()
         for handle in handles:
             handle.close()
         for name in list(self._shown):
@@ -101,14 +103,19 @@ class LiveSource(ViewerSource):
 
     # Robots come and go
 
-    def _on_gateway(self, name: str, alive: bool) -> None:
-        if alive and name not in self._shown:
+    def _on_robot(self, name: str) -> None:
+        """Show or hide a robot as the model of the fleet has it; warn of what is wrong with it."""
+        robot = self._model.robots[name]
+        if robot.alive and name not in self._shown and (not self._robots or name in self._robots):
             if len(self._shown) >= ROBOTS:
                 self._left_out.value += 1
                 return
             self._show(name)
-        elif not alive and name in self._shown:
+        elif not robot.alive and name in self._shown:
             self._hide(name)
+        if name in self._shown:
+            self.hub.warn(f"latched.{name}", f"{name}: {robot.stopped_by}" if robot.stopped_by else None)
+            self.hub.warn(f"state.{name}", f"{name}: {robot.missing}" if robot.missing else None)
 
     def _show(self, name: str) -> None:
         self._shown[name] = shown = _Shown(KeySpace(self._realm, name), self._subscribe)
@@ -121,6 +128,7 @@ class LiveSource(ViewerSource):
         shown = self._shown[name]
         self._commands.robot_left(name)
         self.hub.warn(f"latched.{name}", None)
+        self.hub.warn(f"state.{name}", None)
         self.hub.withdraw([channel.topic for channel in shown.offered.values()])
         del self._shown[name]
         shown.subscribed.need(set())
@@ -135,12 +143,6 @@ class LiveSource(ViewerSource):
         if shown is not None and (devices := read_payload(Devices, sample.payload, self._malformed)) is not None:
             for device in devices.devices:
                 self._found(shown, topics.SENSOR(device.name).path)
-
-    def _on_control(self, sample: Sample) -> None:
-        name = sample.key.split("/")[1]
-        if name in self._shown and (control := read_payload(Control, sample.payload, self._malformed)) is not None:
-            text = "; ".join(latch.described for latch in control.latches)
-            self.hub.warn(f"latched.{name}", f"{name}: {text}" if text else None)
 
     def _found(self, shown: _Shown, path: str) -> None:
         if path not in shown.offered and shown.sensors < SENSORS:

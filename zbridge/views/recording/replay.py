@@ -16,7 +16,8 @@ from zbridge.control.latch import LatchRecord
 from zbridge.errors import ConfigError, Held, PayloadError, ZbridgeError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Sessions, Status
+from zbridge.fleet.messages import Status
+from zbridge.fleet.processes import Sessions
 from zbridge.fleet.topics import Delivery, KeySpace, is_name, split_key
 from zbridge.hq import Listener, ListenerPlan, RobotSubscription
 from zbridge.metrics import Metrics

@@ -14,8 +14,8 @@ import pytest
 from tests.fake_bus import FakeBus
 from tests.views.recording import files
 from zbridge.bus import BusSettings
-from zbridge.cli.bus import print_columns
 from zbridge.cli.recording import RecordOptions, ReplayOptions, run_record, run_replay, run_wire, show_info
+from zbridge.cli.terminal import Column, Table
 from zbridge.errors import ConfigError
 from zbridge.fleet import topics
 
@@ -164,10 +164,10 @@ def test_information_of_many_keys_takes_a_bounded_time_for_each(capsys: pytest.C
 
     sys.setprofile(count)
     try:
-        print_columns(rows)
+        Table([Column(""), *6 * [Column("", number=True)]], rows).print()
     finally:
         sys.setprofile(None)
-    lines = capsys.readouterr().out.splitlines()
+    _, *lines = capsys.readouterr().out.splitlines()
     assert [tuple(line.split()) for line in lines] == rows
     assert calls / len(rows) < 300
 

@@ -71,7 +71,7 @@ def test_of_a_robot_that_has_no_hq_side_the_demo_says_so_and_a_listener_is_a_cle
     assert f"zbridge: protocol = 'torn': {why}; the demo continues without it\n" in shown
     assert "  toy1: serves no HQ programs" in shown
     assert "  alf1: zbridge simulate alf --hq tcp://127.0.0.1:" in shown
-    row = [line for line in shown.splitlines() if "toy1" in line and "│" in line][-1]
+    row = [line for line in shown.splitlines() if line.startswith("toy1 ")][-1]
     assert "established" in row, row
     file = tmp_path / "r1.toml"
     file.write_text('[robot]\nname = "r1"\n' + listener("hq", "toy", 4001))

@@ -1,20 +1,22 @@
 """The command line.
 
-Commands: ``zbridge run, check, init, simulate, probe, demo, router, foxglove, ls, health, echo, drive, stop,
-unlatch, restart, certs, record, info, export, mark, replay, ros2``.
+Commands: ``zbridge run, check, init, simulate, probe, demo, router, foxglove, ls, top, doctor, health, echo,
+drive, stop, unlatch, restart, certs, record, info, export, mark, replay, ros2``.
 
-Knows no protocol. Only this package imports typer and rich, and this module does not: ``zbridge run`` loads neither.
-``app`` declares the commands; ``certs``, ``robot_commands`` and ``recording_commands`` declare groups of them. ``bus``,
-``demo`` (with ``demo_bus``), ``drive``, ``gateway_commands``, ``probe``, ``recording``, ``router``, ``supervise`` and
-``viewers`` implement them. ``keyboard`` converts keys to drives; ``fork_server`` forks the gateways of
-``zbridge run DIR``. Exit codes: 0 done, 1 failed, 2 wrong arguments or configuration; those of
-``health`` are for monitoring programs.
+Knows no protocol. Only this package imports typer, and this module does not: ``zbridge run`` loads neither typer nor
+rich. ``app`` declares the commands; ``certs``, ``doctor``, ``robot_commands`` and ``recording_commands`` declare groups
+of them. ``bus``, ``check``, ``demo`` (with ``demo_bus``), ``diagnosis``, ``drive``, ``echo``, ``gateway_commands``,
+``probe``, ``recording``, ``router``, ``supervise``, ``top`` and ``viewers`` implement them; ``terminal`` prints lines
+and tables. ``keyboard`` converts keys to drives; ``fork_server`` forks the gateways of ``zbridge run DIR``. Exit codes:
+``docs/commands.md``.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import gc
+import io
 import logging
 import os
 import signal
@@ -27,7 +29,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from zbridge.app import Gateway, load, until_signal
 from zbridge.app.handover import Spawn
 from zbridge.bus.tls.files import TLS_VARIABLE
-from zbridge.errors import ConfigError, ZbridgeError
+from zbridge.errors import ConfigError, ZbridgeError, describe
 from zbridge.fleet.printable import shown
 from zbridge.host.addresses import hold_addresses
 from zbridge.host.settings import HostSettings, require_different_robots, require_one_bus
@@ -41,25 +43,58 @@ if TYPE_CHECKING:  # loaded only under a supervisor
 
 
 def main() -> None:
-    """Run the command line; print a ZbridgeError as one line on stderr."""
+    """Run the command line; print an error that its user can make as one line on stderr."""
+    _open_standard_streams()
     try:
-        match sys.argv[1:]:
-            case ["run", file] if not file.startswith("-") and not Path(file).is_dir():
-                run_gateway(Path(file))
-            case ["run", file, "--take-over", descriptor] if not file.startswith("-"):
-                run_gateway(Path(file), take_over=int(descriptor))
-            case ["run", *_, "--resume", descriptor] if descriptor.isdecimal():
-                from zbridge.cli.supervise import resume
-
-                resume(int(descriptor))
-            case _:
-                from zbridge.cli.app import app
-
-                app()
+        try:
+            _run(sys.argv[1:])
+        finally:
+            sys.stdout.flush()
     except ConfigError as error:
         give_up(2, error)
     except ZbridgeError as error:
         give_up(1, error)
+    except OSError as error:
+        _discard_output()
+        if isinstance(error, BrokenPipeError):  # whoever reads has seen enough
+            sys.exit(1)
+        give_up(1, describe(error))
+
+
+def _run(words: Sequence[str]) -> None:
+    match words:
+        case ["run", file] if not file.startswith("-") and not Path(file).is_dir():
+            run_gateway(Path(file))
+        case ["run", file, "--take-over", descriptor] if not file.startswith("-") and descriptor.isdecimal():
+            run_gateway(Path(file), take_over=int(descriptor))
+        case ["run", *_, "--resume", descriptor] if descriptor.isdecimal():
+            from zbridge.cli.supervise import resume
+
+            resume(int(descriptor))
+        case _:
+            from zbridge.cli.app import app
+
+            app()
+
+
+def _open_standard_streams() -> None:
+    """Open what was closed, like ``zbridge ls 2>&-``, as the null device, and print any character on any terminal.
+
+    Zenoh and uvloop abort the process if one of the three descriptors is another file.
+    """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            stream = open(os.devnull, mode)  # noqa: SIM115 - it gets the lowest descriptor, which is the closed one
+            os.set_inheritable(stream.fileno(), True)
+            setattr(sys, name, stream)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
+
+
+def _discard_output() -> None:
+    """Keep Python from writing at its end what could not be written before."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def run_only(protocol: str) -> None:

@@ -9,10 +9,11 @@ from typing import Annotated
 
 import typer
 
-from zbridge.app import listener_template, load, robot_template, until_signal
-from zbridge.bus.tls.files import ends_soon, folder_tls, out_of_date, utc_now
+from zbridge.app import addressed, listener_template, robot_template, secured, until_signal
+from zbridge.bus.tls.files import folder_tls
 from zbridge.cli import (
     certs,
+    doctor,
     give_up,
     hand_on_tls,
     recording_commands,
@@ -23,33 +24,38 @@ from zbridge.cli import (
     run_together,
     set_up_log,
 )
-from zbridge.cli.options import Connect, FileTls, Realm, TlsFolder, check_name
+from zbridge.cli.options import Connect, FileTls, Json, Realm, TlsFolder, check_name
 from zbridge.client import bus_settings
-from zbridge.errors import ConfigError
-from zbridge.fleet.printable import shown
-from zbridge.host.addresses import require_free
+from zbridge.errors import ConfigError, LinkError
 from zbridge.host.settings import HostSettings, load_host, robot_files
-from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.protocol.plugin import HqSimulation, Protocol, Simulation, find_protocol, protocol_names
-from zbridge.security.member import check_member, not_checked
 from zbridge.tasks import together
 from zbridge.toml import prefixed
+from zbridge.version import __version__
 
 app = typer.Typer(
     help=__doc__,
+    epilog="Exit codes: 0 done, 1 failed, 2 wrong arguments or configuration, 130 interrupted; commands say their own.",
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
 app.add_typer(certs.app, name="certs")
 app.add_typer(robot_commands.app)
+app.add_typer(doctor.app)
 app.add_typer(recording_commands.app)
 
-File = Annotated[Path, typer.Argument(help="a gateway's configuration (TOML)", show_default=False)]
 Files = Annotated[
     list[Path], typer.Argument(help="a gateway's configuration (TOML), several, or a directory", show_default=False)
+]
+ProtocolName = Annotated[
+    str,
+    typer.Argument(
+        help="one of: " + ", ".join(protocol_names()),
+        show_default=False,
+        autocompletion=protocol_names,
+    ),
 ]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="log every frame")]
 SimulatedAt = Annotated[
@@ -65,6 +71,21 @@ ServedBy = Annotated[
 Drives = Annotated[
     str, typer.Option(help="with --hq: drive FORWARD or FORWARD,TURN, fractions of full scale: 0.3 or 0.3,-0.2")
 ]
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"zbridge {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def common(
+    version: Annotated[
+        bool, typer.Option("--version", help="print the version and exit", is_eager=True, callback=_print_version)
+    ] = False,
+) -> None:
+    """Take the options that stand before the command."""
 
 
 @app.command()
@@ -105,51 +126,56 @@ def _robot_files(paths: list[Path]) -> list[Path]:
 
 
 @app.command()
-def check(file: File, tls: FileTls = None) -> None:
-    """Check a configuration and print what it would run."""
-    plan = load(file, tls=tls)
-    robot, parts = plan.config.robot, []
-    with prefixed(f"{file}: "):
-        require_free(plan)
-        certificate = check_member(plan)
-        if plan.device is not None:
-            plan.device.make_robot(Metrics())
-    if plan.device is not None:
-        parts.append(f"{plan.device.protocol.name} at {', '.join(map(str, plan.device.addresses))}")
-    if plan.camera is not None:
-        relayed = f", relayed at {plan.camera.relay}" if plan.camera.relay is not None else ""
-        parts.append(f"camera at {plan.camera.source}{relayed}")
-    parts += [f"{listener.protocol.name} HQ programs at {listener.address}" for listener in plan.listeners]
-    parts.append(f"bus as {plan.config.bus.effective_mode}")
-    if certificate is not None:
-        if problem := out_of_date(certificate, utc_now()):
-            raise ConfigError(f"{file}: {problem}")
-        parts.append(f"certificate of {certificate.common_name} until {certificate.ends:%Y-%m-%d}")
-    typer.echo(shown(f"{file}: ok: {robot.realm}/{robot.name}, {', '.join(parts)}"))
-    if certificate is not None:
-        if warning := ends_soon(certificate, utc_now()):
-            typer.echo(shown(f"{file}: warning: {warning}"), err=True)
-        typer.echo(shown(f"{file}: {not_checked(plan, certificate)}"))
+def check(
+    file: Annotated[
+        Path,
+        typer.Argument(help="a gateway's configuration (TOML), or a directory: all its files", show_default=False),
+    ],
+    tls: FileTls = None,
+    json: Json = False,
+) -> None:
+    """Check a configuration, or all of a directory, and print what they would run.
+
+    Exit code 2: one is faulty.
+    """
+    from zbridge.cli.check import check as check_files
+
+    if not check_files(file, tls, as_json=json):
+        raise typer.Exit(2)
 
 
 @app.command()
 def init(
-    protocol: Annotated[str, typer.Argument(help="one of: " + ", ".join(protocol_names()), show_default=False)],
+    protocol: ProtocolName,
     name: Annotated[str, typer.Option(help="the robot's name on the bus")] = "r1",
     hq: Annotated[bool, typer.Option("--hq", help="for a process that only serves HQ programs")] = False,
+    connect: Annotated[
+        list[str],
+        typer.Option(metavar="ADDRESS", help="the robot's address, tcp://host:port; once for each link"),
+    ] = [],
+    secure: Annotated[bool, typer.Option("--secure", help="for a secure bus: with the files of a certificate")] = False,
 ) -> None:
     """Print a commented configuration to start from."""
     check_name("--name", name)
     found = find_protocol(protocol)
     if hq and found.hq is None:
         give_up(2, f"{protocol} serves no HQ programs")
+    if hq and connect:
+        give_up(2, "--connect: not with --hq: a listener finds its robot on the bus, by --name")
+    if len(connect) > found.links:
+        give_up(2, f"--connect: a {protocol} robot has at most {found.links} link{'s' if found.links > 1 else ''}")
+    with prefixed("--connect ", LinkError):
+        for address in connect:
+            found.device_address(address)
     template = listener_template(found) if hq else robot_template(found)
+    template = secured(template) if secure else template
+    template = addressed(template, connect) if connect else template
     typer.echo(template.replace("{name}", name), nl=False)
 
 
 @app.command()
 def simulate(
-    protocol: Annotated[str, typer.Argument(help="one of: " + ", ".join(protocol_names()), show_default=False)],
+    protocol: ProtocolName,
     listen: SimulatedAt = [],
     hq: ServedBy = "",
     drive: Drives = "",
@@ -171,11 +197,15 @@ def simulate(
     if drive and not hq:
         give_up(2, "--drive: only with --hq")
     if hq:
-        program = HqSimulation(Address.parse(hq), version or None, dialect or None, udp, read_drive(drive))
+        with prefixed("--hq ", LinkError):
+            address = Address.parse(hq)
+        program = HqSimulation(address, version or None, dialect or None, udp, read_drive(drive))
         simulate_hq(simulated, program)
         return
+    with prefixed("--listen ", LinkError):
+        addresses = tuple(map(Address.parse, listen or default_addresses(simulated)))
     simulation = Simulation(
-        tuple(map(Address.parse, listen or default_addresses(simulated))),
+        addresses,
         seed,
         version or None,
         dialect or None,
@@ -215,7 +245,8 @@ async def simulate_robot(simulated: Protocol, simulation: Simulation, camera: st
         return
     from zbridge.simulation.camera import serve_camera
 
-    address = Address.parse(f"tcp://{camera}")
+    with prefixed("--camera ", LinkError):
+        address = Address.parse(f"tcp://{camera}")
     work = serve_camera(address, lambda url: print(f"camera at {url}", flush=True))  # noqa: T201
     await together(simulated.simulate(simulation), work)
 
@@ -232,7 +263,7 @@ def simulate_hq(simulated: Protocol, simulation: HqSimulation) -> None:
 
 @app.command()
 def probe(
-    protocol: Annotated[str, typer.Argument(help="one of: " + ", ".join(protocol_names()), show_default=False)],
+    protocol: ProtocolName,
     address: Annotated[str, typer.Argument(help="tcp://host:port or serial:///path?baud=N", show_default=False)],
     yes: Annotated[
         bool, typer.Option("--yes", help="connect to the device although that may use up its only connection")
@@ -240,23 +271,34 @@ def probe(
     connect: Connect = [],
     tls: TlsFolder = None,
     realm: Realm = "fleet",
+    json: Json = False,
 ) -> None:
-    """Print what a device is: as its gateway reports on the bus, or, with --yes, after a handshake with it."""
+    """Print what a device is: as its gateway reports on the bus, or, with --yes, after a handshake with it.
+
+    Exit code 1: no handshake; 2: not contacted without --yes.
+    """
     from zbridge.cli.probe import probe as ask
 
     found = find_protocol(protocol)
-    run_command(ask(bus_settings(connect, tls), found, found.device_address(address), realm=realm, sure=yes))
+    with prefixed("ADDRESS ", LinkError):
+        at = found.device_address(address)
+    run_command(ask(bus_settings(connect, tls), found, at, realm=realm, sure=yes, as_json=json))
 
 
 @app.command()
 def demo(
-    seconds: Annotated[float, typer.Option(help="end after this many seconds; 0: run until interrupted")] = 0.0,
+    seconds: Annotated[
+        float, typer.Option(help="end after this many seconds; 0: run until interrupted", min=0.0)
+    ] = 0.0,
     secure: Annotated[
         bool,
         typer.Option("--secure", help="use mutual TLS with generated certificates; needs zbridge[certs]"),
     ] = False,
 ) -> None:
-    """Show a simulated robot of each protocol, their gateways, a router and a live table; loopback only."""
+    """Show a simulated robot of each protocol, their gateways, a router and a live table; loopback only.
+
+    Exit code 1: with --seconds, a robot sent no data.
+    """
     from zbridge.cli.demo import run_demo
 
     run_command(run_demo(seconds, secure=secure), level=logging.WARNING)

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Annotated
 import msgspec
 import typer
 
+from zbridge.cli.options import Json
+from zbridge.cli.terminal import Column, Table
 from zbridge.errors import ConfigError
 from zbridge.fleet.printable import as_json, shown
 from zbridge.security.files import Folder
@@ -35,8 +37,10 @@ Force = Annotated[bool, typer.Option("--force", help="replace what exists")]
 RESTART = "Restart the router, which reads roles.toml when it starts. That loses the bus: every driven robot stops."
 _PRINT = 8
 """Bytes of a fingerprint shown in the table; --json shows all."""
-_WIDTH = 180
-"""Least width of the table, characters, also on narrower terminals."""
+_COLUMNS = (
+    *(Column("name"), Column("role", 3), Column("robots", 5), Column("hosts", 4)),
+    *(Column("expires", 1, number=True), Column("fingerprint", 6), Column("problem", 2)),
+)
 
 
 @app.command()
@@ -118,7 +122,7 @@ def renew(
 @app.command("list")
 def list_names(
     directory: Directory = Path("certs"),
-    json: Annotated[bool, typer.Option("--json", help="one JSON object a line")] = False,
+    json: Json = False,
 ) -> None:
     """List the names: role, robots, hosts, expiry, fingerprint, and what is wrong."""
     folder = opened(directory)
@@ -130,7 +134,7 @@ def list_names(
             expires = entry.expires.isoformat() if entry.expires else None
             say(as_json(msgspec.structs.asdict(entry) | {"expires": expires}))
     else:
-        _print_table(entries)
+        Table(_COLUMNS, map(_row, entries)).print()
 
 
 @app.command()
@@ -200,23 +204,15 @@ def print_issued(folder: Folder, name: str, issued: Issued) -> None:
     say(f"{folder.of(name).folder}: {issued.common_name}, expires {issued.expires:%Y-%m-%d}, {issued.fingerprint}")
 
 
-def _print_table(entries: list[ListedCertificate]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    console = Console(highlight=False, soft_wrap=True, markup=False, emoji=False)
-    console.width = max(console.width, _WIDTH)
-    table = Table("name", "role", "robots", "hosts", "expires", "fingerprint", "problem", box=None)
-    for entry in entries:
-        cells = (
-            entry.name,
-            entry.role or "",
-            " ".join(entry.robots),
-            " ".join(entry.hosts),
-            f"{entry.expires:%Y-%m-%d}" if entry.expires else "",
-            f"{entry.fingerprint[: 3 * _PRINT]}..." if entry.fingerprint else "",
-            entry.problem,
-        )
-        table.add_row(*(Text(shown(cell)) for cell in cells))
-    console.print(table)
+def _row(entry: ListedCertificate) -> tuple[str, ...]:
+    expires = f"{entry.expires:%Y-%m-%d}" if entry.expires else ""
+    fingerprint = f"{entry.fingerprint[: 3 * _PRINT]}..." if entry.fingerprint else ""
+    return (
+        entry.name,
+        entry.role or "",
+        " ".join(entry.robots),
+        " ".join(entry.hosts),
+        expires,
+        fingerprint,
+        entry.problem,
+    )

@@ -20,12 +20,12 @@ from typing import IO
 import msgspec
 from rich.console import Console
 from rich.live import Live
-from rich.table import Table
+from rich.text import Text
 
 from zbridge.app import until_signal
 from zbridge.bus import BusSettings, Sample, open_bus
-from zbridge.cli.bus import cell
 from zbridge.cli.demo_bus import REALM, START_S, DemoBus, end, free_port, process, secure_bus
+from zbridge.cli.terminal import Column, Table
 from zbridge.client import LOCAL_ROUTER, Fleet, Robot
 from zbridge.errors import BusError, ConfigError, LeaseLost, NeutralFirst, NotReady, PayloadError, Refused, ZbridgeError
 from zbridge.fleet import payload as payloads
@@ -44,6 +44,12 @@ FIGURE_S = 2.0
 PRIORITY = -1
 """Below the default of 0: any other program that acquires a robot gets it."""
 _RATES = ("pose", "scan", "map", "sensor")
+_COLUMNS = (
+    *(Column("robot"), Column("state", 1), Column("version", 3), Column("driver", 2)),
+    *(Column(title, number=True) for title in (*(f"{name}/s" for name in _RATES), "x m", "y m", "turn")),
+)
+_PIPED = 500
+"""Characters of a line that is piped: none is cut."""
 _NO_DATA = (topics.STATUS.path, topics.CONTROL.path)
 
 
@@ -78,11 +84,9 @@ class LiveTable:
             elif split[2] == topics.POSE.path:
                 row.pose = payloads.decode(Pose, sample.payload)
 
-    def table(self, seconds: float) -> Table:
-        """Draw the table; the counts since the last drawing become rates."""
-        table = Table(title="zbridge demo", expand=False, padding=(0, 0))
-        for title in ("robot", "state", "version", "driver", *(f"{name}/s" for name in _RATES), "x m", "y m", "turn"):
-            table.add_column(title, justify="left" if title in ("robot", "state", "driver") else "right", no_wrap=True)
+    def table(self, seconds: float, room: int) -> Text:
+        """Draw the table, ``room`` characters wide at most; the counts since the last drawing become rates."""
+        rows = []
         for robot, row in self.rows.items():
             state = row.status.state if row.status else "no gateway yet"
             version = (row.status.version or "") if row.status else ""
@@ -90,8 +94,10 @@ class LiveTable:
             rates = [f"{row.counts[name] / seconds:.1f}" for name in _RATES]
             pose = row.pose
             where = [f"{pose.x:.2f}", f"{pose.y:.2f}", f"{math.degrees(pose.heading):.0f}°"] if pose else ["", "", ""]
-            table.add_row(*map(cell, (robot, state, version, driver, *rates, *where)))
+            rows.append((robot, state, version, driver, *rates, *where))
             row.counts.clear()
+        table = Table(_COLUMNS, rows).text(room)
+        table.no_wrap, table.overflow = True, "crop"
         return table
 
 
@@ -209,10 +215,11 @@ async def _show(fleet: Fleet, watch: LiveTable, seconds: float, how: list[str]) 
     started = loop.time()
     wandering = [asyncio.create_task(wander(fleet[robot])) for robot in watch.rows]
     try:
-        with Live(console=Console(), auto_refresh=False) as live:
+        console = Console(width=None if sys.stdout.isatty() else _PIPED)
+        with Live(console=console, auto_refresh=False) as live:
             while not seconds or loop.time() - started < seconds:
                 await asyncio.sleep(REFRESH_S)
-                live.update(watch.table(REFRESH_S), refresh=True)
+                live.update(watch.table(REFRESH_S, console.width), refresh=True)
     finally:
         for task in wandering:
             task.cancel()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -13,12 +14,28 @@ from zbridge.bus.tls.files import TLS_VARIABLE
 from zbridge.cli import give_up
 from zbridge.fleet.topics import is_name
 
-Realm = Annotated[str, typer.Option(help="first chunk of all keys")]
+ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws|unixsock-stream|serial|vsock)/\S+")
+
+
+def _read_realm(realm: str) -> str:
+    check_name("--realm", realm)
+    return realm
+
+
+def _read_endpoints(endpoints: list[str]) -> list[str]:
+    for endpoint in endpoints:
+        if not ENDPOINT.fullmatch(endpoint) or not endpoint.isprintable():
+            give_up(2, f"--connect {endpoint!r}: expected an endpoint like tcp/192.168.0.2:7447")
+    return endpoints
+
+
+Realm = Annotated[str, typer.Option(help="first chunk of all keys", callback=_read_realm)]
 Connect = Annotated[
     list[str],
     typer.Option(
         help="Zenoh endpoint, for example tcp/192.168.0.2:7447; without it: multicast and the router on this machine",
         envvar="ZBRIDGE_CONNECT",
+        callback=_read_endpoints,
         show_default=False,
     ),
 ]
@@ -39,6 +56,9 @@ FileTls = Annotated[
         show_default=False,
     ),
 ]
+
+
+Json = Annotated[bool, typer.Option("--json", help="one JSON object a line")]
 
 
 S = TypeVar("S", bound=msgspec.Struct)

@@ -2,45 +2,62 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import json
-
-import msgspec
+from typing import Any
 
 from zbridge.bus import BusSettings
-from zbridge.cli.bus import console, errors, joined
+from zbridge.cli.terminal import builtins, console, errors
+from zbridge.client import joined
+from zbridge.doctor.probe import shake_hands
 from zbridge.errors import BusError, BusRefused, LinkError, PayloadError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import Status
+from zbridge.fleet.printable import as_json as to_json
 from zbridge.fleet.printable import shown
 from zbridge.fleet.topics import split_key
-from zbridge.metrics import Metrics
 from zbridge.protocol.address import DeviceAddress
 from zbridge.protocol.plugin import Protocol
-from zbridge.protocol.session import State
-from zbridge.transport import Conversation, ConversationHooks, Link, connect
 
-PROBE_S = 15.0
-"""Time limit of a handshake, seconds."""
 WARNING = (
     "{address} has no gateway on the bus. Legacy robots give one usable connection per start of the robot program: "
     "probing uses it up, and the robot must be restarted before a gateway can connect. Give --yes to probe."
 )
 
 
-async def probe(settings: BusSettings, protocol: Protocol, address: DeviceAddress, *, realm: str, sure: bool) -> int:
+async def probe(
+    settings: BusSettings,
+    protocol: Protocol,
+    address: DeviceAddress,
+    *,
+    realm: str,
+    sure: bool,
+    as_json: bool = False,
+) -> int:
     """Print what the device is; return the exit code: 0 known, 1 no handshake, 2 not probed without ``sure``."""
     served = await _served(settings, address, realm)
     if served is not None:
         robot, status = served
-        console.print(shown(f"{address} is served by the gateway of {robot}:"))
-        _show(msgspec.to_builtins(status))
-        return 0
-    if not sure:
+        fields, code = builtins(status), 0
+        if not as_json:
+            console.print(shown(f"{address} is served by the gateway of {robot}:"))
+    elif not sure:
         errors.print(WARNING.format(address=address))
         return 2
-    return await _talk(protocol, address)
+    else:
+        try:
+            robot, (fields, code) = None, await _talk(protocol, address)
+        except LinkError as error:
+            reason = str(error).removeprefix(f"{address}: ")
+            errors.print(shown(f"{address}: {reason}"))
+            if as_json:
+                console.print(to_json({"address": str(address), "robot": None, "reason": reason}))
+            return 1
+    if as_json:
+        console.print(to_json({"address": str(address), "robot": robot, **fields}))
+    else:
+        _show(fields)
+    return code
 
 
 async def _served(settings: BusSettings, address: DeviceAddress, realm: str) -> tuple[str, Status] | None:
@@ -64,52 +81,20 @@ async def _served(settings: BusSettings, address: DeviceAddress, realm: str) -> 
     return None
 
 
-async def _talk(protocol: Protocol, address: DeviceAddress) -> int:
-    """Do a handshake with the device, print what was agreed, and disconnect; return the exit code."""
-    loop = asyncio.get_running_loop()
-    robot = protocol.robot(protocol.options(), 1, Metrics())
-    session = robot.session(robot.link_names[0], str(address))
-    settled = asyncio.Event()
-
-    def changed() -> None:
-        if session.state is State.ESTABLISHED:
-            settled.set()
-
-    link: Link | None = None
-    conversation = Conversation(session, loop, ConversationHooks(changed=changed))
-    conversation.ended.add_done_callback(lambda _: settled.set())
-    try:
-        link = await connect(address, conversation)
-        async with asyncio.timeout(PROBE_S):
-            await settled.wait()
-    except (LinkError, TimeoutError) as error:
-        errors.print(shown(f"{address}: {error or 'no handshake'}"))
-        return 1
-    finally:
-        established, seen = session.version is not None, session.snapshot()
-        await _hang_up(conversation, link)
-    _show(
-        {
-            "protocol": protocol.name,
-            "dialect": robot.dialect,
-            "version": seen.version or None,
-            "features": list(seen.features),
-            "transport": seen.transport,
-            "reason": seen.reason,
-            "malformed": seen.counters["malformed"],
-        }
-    )
-    return 0 if established else 1
-
-
-async def _hang_up(conversation: Conversation, link: Link | None) -> None:
-    conversation.close("probed")
-    with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(1.0):
-            await asyncio.shield(conversation.ended)
-    conversation.abandon()
-    if link is not None:
-        await link.ended()
+async def _talk(protocol: Protocol, address: DeviceAddress) -> tuple[dict[str, Any], int]:
+    """Do a handshake with the device, and disconnect; return what was agreed, and the exit code; raise LinkError."""
+    probed = await shake_hands(protocol, address)
+    seen = probed.session
+    fields = {
+        "protocol": protocol.name,
+        "dialect": probed.dialect,
+        "version": seen.version,
+        "features": list(seen.features),
+        "transport": seen.transport,
+        "reason": seen.reason,
+        "malformed": seen.counters["malformed"],
+    }
+    return fields, int(not probed.established)
 
 
 def _show(fields: dict[str, object]) -> None:

@@ -17,7 +17,9 @@ import zbridge
 from zbridge.app import until_signal
 from zbridge.bus import BusSettings, read_key_expr
 from zbridge.bus.tls.files import own_name, own_role
-from zbridge.cli.bus import console, errors, joined, print_columns
+from zbridge.bus.tls.membership import Right, require_right
+from zbridge.cli.terminal import Column, Table, console, errors
+from zbridge.client import joined
 from zbridge.client.driver import default_who
 from zbridge.errors import ConfigError, LinkError, ZbridgeError
 from zbridge.fleet.printable import as_json as to_json
@@ -36,14 +38,18 @@ from zbridge.views.recording.player import Player
 from zbridge.views.recording.recorder import Recorder
 from zbridge.views.recording.replay import Replay, ReplayPlan, plan_listeners, plan_names, survey
 from zbridge.views.recording.selection import read_seconds, read_selection, read_split
-from zbridge.views.recording.summary import Summary, summarize
+from zbridge.views.recording.summary import KeySummary, Summary, summarize
 from zbridge.views.recording.tape import Tape, TapeSettings
 from zbridge.views.recording.wire_robot import WireLink
 
 _LOSSES = 20
 """Most keys with losses that are printed."""
+_KEY_COLUMNS = (
+    *(Column("key"), Column("messages", 1, number=True), Column("Hz", 2, number=True)),
+    *(Column("longest pause s", 3, number=True), Column("gaps", 4, number=True), Column("bytes", 5, number=True)),
+    Column("schema", 6),
+)
 _LEAST_BUFFER = 2**20
-_MARKS_NOT = ("viewer", "recorder")
 
 
 class RecordOptions(msgspec.Struct, frozen=True, kw_only=True):
@@ -142,11 +148,11 @@ def _report_end(recorder: Recorder, tape: Tape, seconds: float) -> None:
 
 
 async def put_mark(settings: BusSettings, realm: str, text: str, who: str | None) -> None:
-    """Put a mark on the bus; raise ConfigError for a role that may not: the router would silently drop it."""
-    if (role := own_role(settings.tls)) in _MARKS_NOT:
-        raise ConfigError(f"a {role} may not mark: expected the certificate of an operator")
+    """Put a mark on the bus; raise BusRefused for a role that may not: the router would silently drop it."""
+    name, role = own_name(settings.tls), own_role(settings.tls)
     async with joined(settings, realm) as bus:
-        await publish_mark(bus, realm, text, who or own_name(settings.tls) or default_who())
+        await require_right(bus.ask, realm, name or default_who(), Right.MARK, role=role or "")
+        await publish_mark(bus, realm, text, who or name or default_who())
 
 
 def show_info(path: Path, *, as_json: bool) -> None:
@@ -171,11 +177,12 @@ def _print_info(summary: Summary) -> None:
     console.print(shown(f"robots: {', '.join(summary.robots) or 'none'}"))
     for name, pairs in summary.metadata:
         console.print(shown(f"{name}: " + ", ".join(f"{key} {value}" for key, value in pairs.items() if value)))
-    rows: list[tuple[str, ...]] = [("key", "messages", "Hz", "longest pause s", "gaps", "bytes", "schema")]
-    for key in summary.keys:
-        numbers = (key.count, f"{key.rate_hz:.2f}", f"{key.gap_s:.3f}", key.gaps or "", key.bytes)
-        rows.append((key.topic, *map(str, numbers), key.schema or key.encoding))
-    print_columns(rows)
+    Table(_KEY_COLUMNS, map(_key_row, summary.keys)).print()
+
+
+def _key_row(key: KeySummary) -> tuple[object, ...]:
+    rate, pause = f"{key.rate_hz:.2f}", f"{key.gap_s:.3f}"
+    return (key.topic, key.count, rate, pause, key.gaps or "", key.bytes, key.schema or key.encoding)
 
 
 def _day(stamp_ns: int) -> str:

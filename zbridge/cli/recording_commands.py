@@ -57,7 +57,10 @@ def record(
     tls: TlsFolder = None,
     realm: Realm = "fleet",
 ) -> None:
-    """Record robots, or all of them, until SIGTERM or SIGINT: every key, commands and refusals too."""
+    """Record robots, or all of them, until SIGTERM or SIGINT: every key, commands and refusals too.
+
+    Exit code 1: the recording failed, for example because the disk is full.
+    """
     from zbridge.cli.recording import RecordOptions, run_record
 
     if sum(map(bool, (robots, everything, keys))) != 1:

@@ -1,6 +1,6 @@
 """Declares what is done with robots of the bus.
 
-``zbridge ls, health, echo, drive, stop, unlatch, restart, foxglove, ros2``.
+``zbridge ls, top, health, echo, drive, stop, unlatch, restart, foxglove, ros2``.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import typer
 
 from zbridge.app import until_signal
 from zbridge.cli import give_up, run_command, set_up_log
-from zbridge.cli.options import Connect, Realm, TlsFolder, check_name
+from zbridge.cli.options import Connect, Json, Realm, TlsFolder, check_name
 from zbridge.client import bus_settings
 
 app = typer.Typer()
@@ -67,13 +67,35 @@ def ls(
     tls: TlsFolder = None,
     realm: Realm = "fleet",
     sessions: Annotated[bool, typer.Option("--sessions", help="list the sessions with robots and HQ programs")] = False,
-    json: Annotated[bool, typer.Option("--json", help="one JSON object a line")] = False,
+    json: Json = False,
 ) -> None:
     """List the robots on the bus, or the sessions of their gateways and listeners."""
     from zbridge.cli import bus
 
     show = bus.list_sessions if sessions else bus.list_robots
     run_command(show(bus_settings(connect, tls), realm, as_json=json))
+
+
+@app.command()
+def top(
+    once: Annotated[bool, typer.Option("--once", help="print the table once, and end")] = False,
+    json: Annotated[bool, typer.Option("--json", help="with --once: one JSON object a line")] = False,
+    sort: Annotated[str, typer.Option(help="column to sort by: robot, state, cpu, ...")] = "robot",
+    text: Annotated[str, typer.Option("--filter", help="show robots that contain each of these words")] = "",
+    connect: Connect = [],
+    tls: TlsFolder = None,
+    realm: Realm = "fleet",
+) -> None:
+    """Watch all robots: states, rates, drivers, refusals, processor, memory; stop them. Needs zbridge[top]."""
+    from zbridge.cli.top import print_once, run_top
+
+    settings = bus_settings(connect, tls)
+    if once:
+        run_command(print_once(settings, realm, sort, text, as_json=json))
+    elif json:
+        give_up(2, "--json: only with --once")
+    else:
+        run_top(settings, realm, sort, text)
 
 
 @app.command()
@@ -84,7 +106,10 @@ def health(
     realm: Realm = "fleet",
     json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
 ) -> None:
-    """Print how the robots are, for monitoring: exit code 0 ok, 1 warning, 2 critical."""
+    """Print how the robots are, for monitoring.
+
+    Exit code 0: ok, 1: warning, 2: critical.
+    """
     from zbridge.cli.bus import report_health
 
     if robot:
@@ -100,19 +125,21 @@ def echo(
     tls: TlsFolder = None,
     json: Annotated[bool, typer.Option("--json", help="one JSON object a line, arrays in full")] = False,
     count: Annotated[int, typer.Option(help="end after this many messages; 0: no limit", min=0)] = 0,
-    seconds: Annotated[float, typer.Option(help="end after this time; 0: no limit", min=0.0)] = 0.0,
+    seconds: Annotated[float, typer.Option(help="end after this time; 0: no limit", min=0.0, max=1e9)] = 0.0,
+    hz: Annotated[bool, typer.Option("--hz", help="print how often messages come, once a second for each key")] = False,
     realm: Annotated[
         str, typer.Option(help="first chunk of all keys; that of KEY by default", show_default=False)
     ] = "",
 ) -> None:
     """Print the messages on a key, decoded, until SIGTERM or SIGINT, --count or --seconds.
 
-    Exit code 1: the time passed with fewer messages than --count, or with none.
+    If nothing comes for two seconds, a hint on stderr says why. Exit code 1: the time passed with fewer messages than
+    --count, or with none.
     """
-    from zbridge.cli import bus
+    from zbridge.cli.echo import Echo, echo
 
-    settings = bus_settings(connect, tls)
-    work = bus.echo(settings, key, realm=realm or None, as_json=json, count=count, seconds=seconds)
+    options = Echo(key=key, as_json=json, count=count, seconds=seconds, hz=hz)
+    work = echo(bus_settings(connect, tls), options, realm=realm or None)
     run_command(until_signal(work))
 
 
@@ -143,12 +170,17 @@ def stop(
     connect: Connect = [],
     tls: TlsFolder = None,
     realm: Realm = "fleet",
+    json: Json = False,
 ) -> None:
-    """Stop a robot, or all of them; open to everyone who can write the key."""
+    """Stop a robot, or all of them; open to everyone who can write the key.
+
+    Exit code 1: not every gateway confirmed it.
+    """
     from zbridge.cli.gateway_commands import stop
 
     _check_one_or_all(robot, everything=everything)
-    run_command(stop(bus_settings(connect, tls), realm, robot or None, latch=latch, reason=reason or None))
+    settings, one = bus_settings(connect, tls), robot or None
+    run_command(stop(settings, realm, one, latch=latch, reason=reason or None, as_json=json))
 
 
 @app.command()
@@ -158,12 +190,16 @@ def unlatch(
     connect: Connect = [],
     tls: TlsFolder = None,
     realm: Realm = "fleet",
+    json: Json = False,
 ) -> None:
-    """Release the latched stops of a robot, or those of the whole fleet; robots move only when somebody drives."""
+    """Release the latched stops of a robot, or those of the whole fleet; robots move only when somebody drives.
+
+    Exit code 1: not every gateway confirmed it.
+    """
     from zbridge.cli.gateway_commands import unlatch
 
     _check_one_or_all(robot, everything=everything)
-    run_command(unlatch(bus_settings(connect, tls), realm, robot or None))
+    run_command(unlatch(bus_settings(connect, tls), realm, robot or None, as_json=json))
 
 
 @app.command()
@@ -174,12 +210,16 @@ def restart(
     connect: Connect = [],
     tls: TlsFolder = None,
     realm: Realm = "fleet",
+    json: Json = False,
 ) -> None:
-    """Restart a robot's gateway, or all of them: robots and HQ programs stay connected; what moves is stopped."""
+    """Restart a robot's gateway, or all of them: robots and HQ programs stay connected; what moves is stopped.
+
+    Exit code 1: refused, or no answer; the gateway continues.
+    """
     from zbridge.cli.gateway_commands import restart as ask
 
     _check_one_or_all(robot, everything=everything)
-    run_command(ask(bus_settings(connect, tls), realm, robot or None, who=who or None))
+    run_command(ask(bus_settings(connect, tls), realm, robot or None, who=who or None, as_json=json))
 
 
 @app.command()

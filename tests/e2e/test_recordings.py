@@ -14,7 +14,7 @@ import pytest
 from tests import captures
 from tests.e2e.conftest import HOST, Bench, device, end, until
 from tests.e2e.measured.hq_judge import Alf, Ec, Program, Tcp
-from tests.e2e.rigs.hq_scene import playing, soon
+from tests.e2e.rigs.hq_scene import playing, pushed, soon
 from tests.ports import free_port
 from tests.views.recording import files
 from zbridge.views.recording.reader import RecordingReader
@@ -95,17 +95,18 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
             bench.gateway(device(bench.simulator(protocol), protocol, options), robot=robot)
         for robot, _, _ in ROBOTS:
             until(lambda: bench.fleet.state(robot) == "established", what=f"{robot} established")  # noqa: B023
-        for path in ("t1/map", "t1/pose", "a1/scan", "a1/motion", "w1/devices"):
-            until(lambda: bench.fleet.last(path), what=path)  # noqa: B023
-        bench.fleet.session.declare_subscriber("fleet/w1/sensor/*", lambda sample: None)
-        until(lambda: bench.fleet.last("w1/sensor/ds0"), what="sensors")
+        # What this session has heard may not have reached the recorder yet.
+        until(lambda: {key for key, _ in messages(folder / "all.mcap")} >= NEEDED, what="what each is known by")
         end(process)
         yield folder / "all.mcap"
 
 
 _BEARINGS = ", ".join(f"ds{number} = {45.0 * number}" for number in range(8))
 _TABLES = ", ".join(f"ds{number} = [[0.0, 0.0], [1000.0, 2.0]]" for number in range(8))
-WEBOTS = {*(f"ds{number}" for number in range(8)), "left wheel", "right wheel", "lift"}
+_SENSORS = {f"ds{number}" for number in range(8)}
+WEBOTS = {*_SENSORS, "left wheel", "right wheel", "lift"}
+_SHOWN = ("t1/map", "t1/pose", "a1/scan", "a1/motion", "w1/devices", *(f"w1/sensor/{name}" for name in _SENSORS))
+NEEDED = {f"fleet/{path}" for path in _SHOWN}
 ROBOTS = [
     ("t1", "tcpudp", ""),
     ("a1", "alf", ""),
@@ -134,8 +135,7 @@ async def test_old_programs_of_every_protocol_see_a_replay_as_the_robot_and_none
     async with playing(*(program.judge.run(HOST, ports[program.name]) for program in programs)):
         await soon(lambda: all(program.ready for program in programs), "all connected")
         await soon(lambda: not [one.name for one in programs if not sees(one, protocol)], "all see the robot", 30.0)
-        await programs[0].drive(0.5)
-        await soon(lambda: bench.fleet.refusal("again", code="unsupported"), "the drive refused")
+        await pushed(programs[0], 0.5, lambda: bench.fleet.refusal("again", code="unsupported"), "the drive refused")
         for program in programs:
             await program.leave()
     assert bench.fleet.last("again/status")["protocol"] == "replay"

@@ -117,10 +117,13 @@ def test_of_two_publishers_the_second_is_refused_and_told_by_whom(scene: Scene) 
     other = Ros(scene.ros_at, "nav", namespace="/planner")
     with contextlib.closing(other), publishing(scene) as publisher:
         begun = time.monotonic()
-        with pushed(publisher, 0.125, lambda: scene.moves(begun)):
-            second = other.publisher("/r1/cmd_vel", TWIST)
-            with repeated(lambda: second.twist(-0.5)):
-                scene.told("r1: cmd_vel", "/planner/nav=r1 is driven by /teleop")
+        second = other.publisher("/r1/cmd_vel", TWIST)
+
+        def refused() -> str:
+            return scene.moves(begun) and scene.shows("r1: cmd_vel", "/planner/nav=r1 is driven by /teleop")
+
+        with repeated(lambda: second.twist(-0.5)), pushed(publisher, 0.125, refused):
+            pass
         assert all(speed > 0 for speed in scene.moves(begun))
 
 

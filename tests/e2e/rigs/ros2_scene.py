@@ -67,18 +67,30 @@ class RosScene:
         stack.callback(self.ros.close)
         self._diagnosed: dict[str, Subscriber] = {}
 
+    def shows(self, name: str, text: str) -> str:
+        """Give the newest diagnostic of this name if it holds a text, in its message or values; else nothing."""
+        heard = self._diagnostics(name).heard
+        entries = [entry for entry in heard[-1].message.status if entry.name == name] if heard else []
+        texts = [" ".join([each.message, *(f"{v.key}={v.value}" for v in each.values)]) for each in entries]
+        return next((each for each in texts if text in each), "")
+
     def told(self, name: str, text: str) -> str:
-        """Wait until a diagnostic of this name holds a text, in its message or values; give them."""
+        """Wait until a diagnostic of this name holds a text; give them."""
+        told = ""
+
+        def shown(heard: list[Heard]) -> str:
+            nonlocal told
+            told = self.shows(name, text)
+            return told
+
+        self._diagnostics(name).until(shown)
+        return told
+
+    def _diagnostics(self, name: str) -> Subscriber:
         robot = name.partition(":")[0]
         if robot not in self._diagnosed:
             self._diagnosed[robot] = self.ros.subscribe(f"/{robot}/diagnostics", DIAGNOSED)
-
-        def shown(heard: list[Heard]) -> str | None:
-            entries = [entry for entry in heard[-1].message.status if entry.name == name] if heard else []
-            texts = [" ".join([each.message, *(f"{v.key}={v.value}" for v in each.values)]) for each in entries]
-            return next((each for each in texts if text in each), None)
-
-        return shown(self._diagnosed[robot].until(shown)) or ""
+        return self._diagnosed[robot]
 
     @contextlib.contextmanager
     def publishing(self, robot: str, type_name: str = TWIST) -> Iterator[Publisher]:

@@ -122,6 +122,8 @@ def test_of_two_publishers_the_second_is_refused_and_told_by_whom(scene: Scene) 
         def refused() -> str:
             return scene.moves(begun) and scene.shows("r1: cmd_vel", "/planner/nav=r1 is driven by /teleop")
 
+        with pushed(publisher, 0.125, lambda: scene.moves(begun)):
+            second.twist(-0.5)  # from now on it owes a zero, also where the first one is held up
         with repeated(lambda: second.twist(-0.5)), pushed(publisher, 0.125, refused):
             pass
         assert all(speed > 0 for speed in scene.moves(begun))

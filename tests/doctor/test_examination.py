@@ -66,18 +66,6 @@ class Robot:
         query.answer(payloads.encode(table))
 
 
-@pytest.fixture
-def bus(monkeypatch: pytest.MonkeyPatch) -> FakeBus:
-    bus = FakeBus()
-
-    @asynccontextmanager
-    async def joined(settings: BusSettings, realm: str) -> AsyncIterator[FakeBus]:
-        yield bus.join("doctor")
-
-    monkeypatch.setattr(on_bus, "joined", joined)
-    return bus
-
-
 async def examined(
     robot: Robot | None, name: str | None = "r1", beats: bool = True, **options: object
 ) -> list[Finding]:

@@ -103,18 +103,6 @@ OTHERWISE = ("the bus is cut", "the listener is killed", "rules of Zenoh's own r
 """Broken by tests of their own, below."""
 
 
-@pytest.fixture
-def bus(monkeypatch: pytest.MonkeyPatch) -> FakeBus:
-    bus = FakeBus()
-
-    @asynccontextmanager
-    async def joined(settings: BusSettings, realm: str) -> AsyncIterator[FakeBus]:
-        yield bus.join("doctor")
-
-    monkeypatch.setattr(on_bus, "joined", joined)
-    return bus
-
-
 async def verdict(robot: Robot | None) -> set[str]:
     """Examine a robot whose gateway may publish once more; give the codes of what is not well."""
     examination = Examination()

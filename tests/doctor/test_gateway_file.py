@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -12,10 +11,8 @@ import pytest
 from tests.certificates import Authority
 from tests.fake_bus import FakeBus
 from tests.ports import free_port
-from zbridge.bus import BusSettings
 from zbridge.bus.tls.files import folder_settings
 from zbridge.cli import doctor as command
-from zbridge.doctor import bus as on_bus
 from zbridge.doctor import gateway_file, here
 from zbridge.doctor.bus import examine_certificate
 from zbridge.doctor.examination import Examination, Options
@@ -33,18 +30,6 @@ def file(tmp_path: Path) -> Path:
     path = tmp_path / "r1.toml"
     path.write_text(FILE.format(port=free_port()))
     return path
-
-
-@pytest.fixture
-def bus(monkeypatch: pytest.MonkeyPatch) -> FakeBus:
-    bus = FakeBus()
-
-    @asynccontextmanager
-    async def joined(settings: BusSettings, realm: str) -> AsyncIterator[FakeBus]:
-        yield bus.join("doctor")
-
-    monkeypatch.setattr(on_bus, "joined", joined)
-    return bus
 
 
 @pytest.fixture

@@ -68,6 +68,18 @@ class GatewayPlan(msgspec.Struct, frozen=True):
     camera: CameraPlan | None = None
 
     @property
+    def described(self) -> str:
+        """What it would run, for people: robot, its address, camera, listeners, part on the bus."""
+        robot, parts = self.config.robot, list[str]()
+        if self.device is not None:
+            parts.append(f"{self.device.protocol.name} at {', '.join(map(str, self.device.addresses))}")
+        if self.camera is not None:
+            relayed = f", relayed at {self.camera.relay}" if self.camera.relay is not None else ""
+            parts.append(f"camera at {self.camera.source}{relayed}")
+        parts += [f"{listener.protocol.name} HQ programs at {listener.address}" for listener in self.listeners]
+        return ", ".join([f"{robot.realm}/{robot.name}", *parts, f"bus as {self.config.bus.effective_mode}"])
+
+    @property
     def setup(self) -> dict[str, Any]:
         """What a gateway and its successor must have in common, by key, as MessagePack reads it back."""
         config = self.config

@@ -62,19 +62,11 @@ class Checked(msgspec.Struct):
 
     def line(self) -> str:
         """Say what a sound file would run."""
-        plan, parts = self.plan, list[str]()
-        if plan is None:
+        if self.plan is None:
             return f"{self.file}: ok"
-        if plan.device is not None:
-            parts.append(f"{plan.device.protocol.name} at {', '.join(map(str, plan.device.addresses))}")
-        if plan.camera is not None:
-            relayed = f", relayed at {plan.camera.relay}" if plan.camera.relay is not None else ""
-            parts.append(f"camera at {plan.camera.source}{relayed}")
-        parts += [f"{listener.protocol.name} HQ programs at {listener.address}" for listener in plan.listeners]
-        parts.append(f"bus as {plan.config.bus.effective_mode}")
-        if self.certificate is not None:
-            parts.append(f"certificate of {self.certificate.common_name} until {self.certificate.ends:%Y-%m-%d}")
-        return f"{self.file}: ok: {plan.config.robot.realm}/{plan.config.robot.name}, {', '.join(parts)}"
+        owner = self.certificate
+        valid = f", certificate of {owner.common_name} until {owner.ends:%Y-%m-%d}" if owner is not None else ""
+        return f"{self.file}: ok: {self.plan.described}{valid}"
 
     def warning(self) -> str | None:
         """Return what will soon be wrong."""

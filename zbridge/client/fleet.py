@@ -13,7 +13,7 @@ from zbridge.bus import Bus, Sample
 from zbridge.client import stops
 from zbridge.client.driver import Driver, default_who
 from zbridge.client.feed import WAITING, WAITING_IMAGES, Feed, StateFeed, reader
-from zbridge.client.fleet_model import FleetModel
+from zbridge.client.fleet_model import FleetModel, watch
 from zbridge.client.settled import settled
 from zbridge.client.stops import Outcome
 from zbridge.clocks import raw_ms
@@ -115,19 +115,14 @@ class Fleet:
         async for named in Feed(self._bus, f"{self.realm}/{robot or '*'}/{topics.STATUS.path}", read):
             yield named
 
-    @contextlib.asynccontextmanager
-    async def watch(
+    def watch(
         self, changed: Callable[[str], None] = lambda name: None, *, lazy: bool = False
-    ) -> AsyncIterator[FleetModel]:
+    ) -> contextlib.AbstractAsyncContextManager[FleetModel]:
         """Follow the state of all robots, without their streams, while the context lasts.
 
         changed: called with a robot's name after each message of its gateway. lazy: see :class:`FleetModel`.
         """
-        model = FleetModel(self._bus, self.realm, changed, lazy=lazy)
-        with contextlib.closing(model):
-            model.open()
-            await model.query()
-            yield model
+        return watch(self._bus, self.realm, changed, lazy=lazy)
 
     async def sessions(self) -> dict[tuple[str, str], tuple[SessionEntry, ...]]:
         """Return the session tables by robot and process: peers, their states, and what was not translated.

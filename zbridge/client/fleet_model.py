@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, closing
 from typing import Any
 
 import msgspec
@@ -203,3 +204,20 @@ class FleetModel:
                 return None
             setattr(entry, field, message)
         return entry
+
+
+@asynccontextmanager
+async def watch(
+    bus: Bus,
+    realm: str,
+    changed: Callable[[str], None] = lambda name: None,
+    clock: Callable[[], float] = time.monotonic,
+    *,
+    lazy: bool = False,
+) -> AsyncIterator[FleetModel]:
+    """Follow the robots of a realm while the context lasts, with the arguments of :class:`FleetModel`."""
+    model = FleetModel(bus, realm, changed, clock, lazy=lazy)
+    with closing(model):
+        model.open()
+        await model.query()
+        yield model

@@ -7,21 +7,21 @@ Theory of operation. A robot's name, or nothing, is examined from anywhere: cert
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Iterable
-from contextlib import asynccontextmanager, closing
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import msgspec
 
 from zbridge.bus import Bus, BusSettings
-from zbridge.client.fleet_model import FleetModel, RobotEntry
+from zbridge.client.fleet_model import RobotEntry, watch
 from zbridge.doctor import bus as on_bus
 from zbridge.doctor.findings import Finding, Layer, Verdict, error, ok
 from zbridge.doctor.refused import why_router_refuses
 from zbridge.errors import BusError, BusRefused
+from zbridge.protocol.address import Address
 
-_CHECK_S = 10.0
-"""Longest time of one check that waits for others."""
+_REACH_S = 5.0
+"""Longest time to connect to a listener."""
 
 
 class Options(msgspec.Struct, frozen=True):
@@ -124,7 +124,7 @@ async def _examine_robots(
     examination: Examination, bus: Bus, realm: str, robot: str | None, options: Options, pid: int | None
 ) -> None:
     changed = asyncio.Event()
-    async with _model(bus, realm, lambda name: changed.set()) as model:
+    async with watch(bus, realm, lambda name: changed.set(), asyncio.get_running_loop().time) as model:
         if robot is not None:
             model.robots.setdefault(robot, RobotEntry(robot))
 
@@ -155,14 +155,12 @@ async def _examine_robots(
 
 
 async def _reach(address: str) -> Finding:
-    """Open a connection to a listener, and close it."""
+    """Open a connection to a listener, and close it; raise LinkError if its address is none."""
     layer = Layer.LISTENERS
-    host, _, port = address.removeprefix("tcp://").rpartition(":")
-    if not host or not port.isdecimal():
-        return error(layer, "bad_address", f"{address}: expected tcp://host:port", None)
+    at = Address.parse(address)
     try:
-        async with asyncio.timeout(_CHECK_S / 2):
-            _, writer = await asyncio.open_connection(host.strip("[]"), int(port))
+        async with asyncio.timeout(_REACH_S):
+            _, writer = await asyncio.open_connection(at.host, at.port)
         writer.close()
     except ConnectionRefusedError:
         return error(
@@ -175,12 +173,3 @@ async def _reach(address: str) -> Finding:
         why = getattr(fault, "strerror", None) or "no answer"
         return error(layer, "not_reached", f"{address} is not reached from here: {why}", "check firewalls and routes")
     return ok(layer, f"{address} accepts connections from here")
-
-
-@asynccontextmanager
-async def _model(bus: Bus, realm: str, changed: Callable[[str], None]) -> AsyncIterator[FleetModel]:
-    model = FleetModel(bus, realm, changed, asyncio.get_running_loop().time)
-    with closing(model):
-        model.open()
-        await model.query()
-        yield model

@@ -42,7 +42,7 @@ async def examine_file(examination: Examination, file: Path, tls: Path | None, o
         return
     robot = plan.config.robot
     examination.of(robot.name)
-    examination.add(ok(Layer.CONFIGURATION, f"{file}: {robot.realm}/{robot.name}, {_summary(plan)}"))
+    examination.add(ok(Layer.CONFIGURATION, f"{file}: {plan.described}"))
     names = examination.add(await here.examine_names(plan))
     examination.add_all(on_bus.examine_certificate(plan.config.bus))
     if names.failed:
@@ -121,11 +121,3 @@ def _as_observer(settings: BusSettings) -> BusSettings:
     mode = "client" if settings.effective_mode == "client" else "peer"
     connect = settings.connect or tuple(each for each in settings.listen if settings.mode == "router")
     return msgspec.structs.replace(settings, mode=mode, listen=(), connect=connect)
-
-
-def _summary(plan: GatewayPlan) -> str:
-    parts = []
-    if plan.device is not None:
-        parts.append(f"{plan.device.protocol.name} at {', '.join(map(str, plan.device.addresses))}")
-    parts += [f"{each.protocol.name} HQ programs at {each.address}" for each in plan.listeners]
-    return ", ".join([*parts, f"bus as {plan.config.bus.effective_mode}"])

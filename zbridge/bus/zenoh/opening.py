@@ -6,6 +6,7 @@ import asyncio
 import json
 import random
 import re
+import threading
 from collections.abc import Mapping
 from typing import Any
 
@@ -16,6 +17,8 @@ from zbridge.bus.tls.refusal import why_not
 from zbridge.errors import BusError, BusRefused
 from zbridge.fleet.topics import SizeBounds
 
+OPEN_S = 60.0
+"""Longest time for Zenoh to open a session: of some thousand, one never opened."""
 RETRY_FIRST_MS, RETRY_MOST_MS, RETRY_FACTOR = (500, 1500), (2000, 4000), 1.5
 """Milliseconds between attempts to reconnect to a router: the first pause, the longest, and the growth factor."""
 _INGRESS = ("ingress",)
@@ -128,8 +131,41 @@ async def open_or_explain(config: zenoh.Config, settings: BusSettings, *, explai
 
 
 async def open_session(config: zenoh.Config) -> zenoh.Session:
-    """Open a session; raise BusError if that is not possible."""
+    """Open a session; raise BusError if that is not possible within :data:`OPEN_S`.
+
+    A thread of its own is abandoned where Zenoh hangs; a session that opens when nobody waits for it is closed.
+    """
+    loop = asyncio.get_running_loop()
+    opened: asyncio.Future[zenoh.Session | BusError] = loop.create_future()
+
+    def attempt() -> None:
+        result: zenoh.Session | BusError
+        try:
+            result = zenoh.open(config)
+        except zenoh.ZError as error:
+            result = BusError(in_short(error))
+        try:
+            loop.call_soon_threadsafe(take, result)
+        except RuntimeError:  # the loop has ended
+            _close(result)
+
+    def take(result: zenoh.Session | BusError) -> None:
+        if not opened.done():
+            opened.set_result(result)
+        else:
+            threading.Thread(target=_close, args=(result,), name="zbridge-close-late", daemon=True).start()
+
+    threading.Thread(target=attempt, name="zbridge-open", daemon=True).start()
     try:
-        return await asyncio.to_thread(zenoh.open, config)
-    except zenoh.ZError as error:
-        raise BusError(in_short(error)) from error
+        async with asyncio.timeout(OPEN_S):
+            result = await opened
+    except TimeoutError:
+        raise BusError(f"Zenoh opened no session within {OPEN_S:g} s") from None
+    if isinstance(result, BusError):
+        raise result
+    return result
+
+
+def _close(result: zenoh.Session | BusError) -> None:
+    if not isinstance(result, BusError):
+        result.close()  # type: ignore[no-untyped-call]

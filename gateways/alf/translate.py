@@ -182,6 +182,10 @@ class AlfRobot(RobotSide):
             return Outcome()
         raise Unsupported("an ALF vehicle has no such command")
 
+    @property
+    def takes(self) -> tuple[str, ...]:
+        return ("drive", "light")
+
     def stop(self, now: float, until: float) -> None:
         self._send(self._neutral(), now, urgent=True)
 

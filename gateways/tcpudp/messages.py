@@ -14,7 +14,7 @@ from typing import ClassVar, TypeVar
 
 import msgspec
 
-from gateways.tcpudp.settings import Feature
+from gateways.tcpudp.settings import Feature, Settings
 from zbridge.protocol import Codec, Datagram, EncodeError, ProtocolError, Role
 from zbridge.wire import F32, I32, U8, BinaryCodec, Blob, Bool, F32Array, Message, Rest, Text
 
@@ -61,6 +61,17 @@ class PacketSpec(msgspec.Struct, frozen=True, eq=False):
     features: tuple[Feature, ...]
     packet: type[Packet]
     codec: BinaryCodec[Packet]
+
+    def lacking(self, settings: Settings | None, version: str | None) -> str:
+        """Return why a robot of these settings may not know the packet, "" if it does.
+
+        Of several features the first one that the robot's version has a flag for decides.
+        """
+        feature = next((feature for feature in self.features if hasattr(settings, feature.value)), None)
+        if feature is None:
+            names = " or ".join(feature.value for feature in self.features)
+            return f"{self.name}: version {version} has no {names}" if names else ""
+        return "" if getattr(settings, feature.value) else f"{self.name}: the robot does not announce {feature.value}"
 
 
 PACKETS: dict[int, PacketSpec] = {}

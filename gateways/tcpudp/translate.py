@@ -106,6 +106,13 @@ class TcpUdpRobot(RobotSide):
             raise Unsupported("a TCP/UDP robot has no such command")
         return carry_out(self, command, now) or _NOTHING
 
+    @property
+    def takes(self) -> tuple[str, ...]:
+        session = self.driving
+        if session is None:
+            return ()
+        return tuple(name for name, any_of in _CARRIERS.items() if any(session.knows(each.spec) for each in any_of))
+
     def stop(self, now: float, until: float) -> None:
         """Send packet 13, or the pair once a mode 3 was sent.
 
@@ -279,6 +286,16 @@ _COMMANDS: dict[str, Callable[[TcpUdpRobot, Any, float], Outcome | None]] = {
     topics.CMD_RAW(NAME).path: TcpUdpRobot._send_raw,
 }
 
+
+_CARRIERS: dict[str, tuple[type[packets.Packet], ...]] = {
+    "drive": (packets.ClientJoystickMove,),
+    "mode": (packets.ClientControllMode,),
+    "lidar": (packets.ClientLidarMode,),
+    "text": (packets.DebugMessage,),
+    "scan": (packets.ClientSimulatedLidarData,),
+    "raw": (packets.ChatMessage, packets.ClientMoveAI),
+}
+"""The commands that some packet carries, and the packets, one of which is enough."""
 
 SCAN_POINTS = 360
 """Points legacy robots take in simulated lidar data, one a degree."""

@@ -169,6 +169,16 @@ class Wc2EcRobot(RobotSide):
             raise Unsupported("a Webots robot has no such command")
         return Outcome()
 
+    @property
+    def takes(self) -> tuple[str, ...]:
+        if self._dialect is messages.Wc2EcDialect.DRAFT:
+            return ("sensor",)
+        rotational = self._table.motors(ROTATIONAL)
+        driven = self._driven
+        drives = bool(driven) and driven <= {device.name for device in rotational}
+        motors = bool(rotational or self._table.motors(LINEAR))
+        return (*(("drive",) if drives else ()), *(("motor",) if motors else ()))
+
     def stop(self, now: float, until: float) -> None:
         """Set every rotational motor to 0. Linear motors keep their position: values that wait for them are dropped."""
         if self._dialect is messages.Wc2EcDialect.DEPLOYED:
@@ -188,7 +198,7 @@ class Wc2EcRobot(RobotSide):
 
     def _drive(self, command: Drive, now: float) -> Outcome:
         velocities = self._velocities(command)
-        missing = sorted(set(velocities) - {device.name for device in self._table.motors(ROTATIONAL)})
+        missing = sorted(self._driven - {device.name for device in self._table.motors(ROTATIONAL)})
         if missing:
             raise Unsupported(f"no rotational motor is registered as {', '.join(missing)}")
         for name, velocity in velocities.items():
@@ -198,6 +208,12 @@ class Wc2EcRobot(RobotSide):
         left_out = [name for name in ("left",) if command.left and self.options.differential is not None]
         left_out += ["light"] if command.light is not None else []
         return Outcome(left_out=f"{' and '.join(left_out)}: this robot has none" if left_out else None)
+
+    @property
+    def _driven(self) -> frozenset[str]:
+        """The motors that a drive moves, by the configuration."""
+        wheels = self.options.differential
+        return frozenset((*wheels.left, *wheels.right) if wheels is not None else self.options.factors)
 
     def _velocities(self, command: Drive) -> dict[str, float]:
         """Return the velocity of every driven motor, rad/s."""

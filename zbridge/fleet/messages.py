@@ -179,6 +179,7 @@ class Status(FleetMessage, frozen=True):
     """Whether the robot can be used, and what was negotiated with it. host: the machine of its gateway.
 
     stalled: True while the robot's link acknowledges nothing: what it is sent waits.
+    commands: what the robot takes now: ``stop``, ``drive``, ``light``, ``motor``; whoever holds the robot or not.
     """
 
     state: RobotState
@@ -190,6 +191,7 @@ class Status(FleetMessage, frozen=True):
     links: tuple[LinkStatus, ...] = ()
     host: str | None = None
     stalled: bool | UnsetType = UNSET
+    commands: tuple[str, ...] = ()
 
 
 class Refusal(msgspec.Struct, frozen=True, kw_only=True):

@@ -73,6 +73,14 @@ class RobotSide(Kept, ABC):
     def command(self, topic: Topic, command: FleetMessage, now: float) -> Outcome:
         """Send a command to the robot; raise Refused with the reason if the robot cannot take it."""
 
+    @property
+    def takes(self) -> tuple[str, ...]:
+        """The commands besides ``stop`` that the robot takes in its present session, as their keys name them.
+
+        Those of motors, sensors and raw messages are ``motor``, ``sensor`` and ``raw``, without the name behind.
+        """
+        return ("drive",)
+
     @abstractmethod
     def stop(self, now: float, until: float) -> None:
         """Send the robot its stop before anything else, and repeat it until ``until``; once if ``until`` is ``now``."""

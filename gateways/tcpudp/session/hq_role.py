@@ -295,21 +295,18 @@ class HqRole(HqHandshake):
             raise EncodeError(f"packet of {len(frame)} bytes, the robot reads {MAX_WRITE} at most")
         return frame
 
+    def knows(self, spec: packets.PacketSpec) -> bool:
+        """Return whether the robot may be sent a packet: because it announces it, or options.force lists it."""
+        return not self._force.isdisjoint({spec.id, *spec.features}) or not spec.lacking(self.settings, self._agreed)
+
     def may_send(self, message: packets.Packet) -> None:
         """Raise Unsupported for a packet that this robot may not know: an unregistered id crashes it."""
         if isinstance(message, packets.OpaquePacket):
             if message.id not in self._force:
                 raise Unsupported(f"packet {message.id} may crash the robot; list it in options.force if it knows it")
             return
-        spec = message.spec
-        if spec.id not in self._force and spec.features and self._force.isdisjoint(spec.features):
-            # Of several features the first one that the robot's version has a flag for decides.
-            feature = next((feature for feature in spec.features if hasattr(self.settings, feature.value)), None)
-            if feature is None:
-                names = " or ".join(feature.value for feature in spec.features)
-                raise Unsupported(f"{spec.name}: version {self._agreed} has no {names}")
-            if not getattr(self.settings, feature.value):
-                raise Unsupported(f"{spec.name}: the robot does not announce {feature.value}")
+        if not self.knows(message.spec):
+            raise Unsupported(message.spec.lacking(self.settings, self._agreed))
         self._registered.add(type(message))
 
     @property

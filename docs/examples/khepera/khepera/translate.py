@@ -80,6 +80,10 @@ class KheperaRobot(protocol.RobotSide):
             self._connected().send(SetLed(0, int(light)))
         return protocol.Outcome(left_out=left_out)
 
+    @property
+    def takes(self) -> tuple[str, ...]:
+        return ("drive", "light")
+
     def stop(self, now: float, until: float) -> None:
         self._drive(SetSpeeds(0, 0), now, period_s=STOP_AGAIN_S, until=until, urgent=True)
 

@@ -20,9 +20,9 @@ from zbridge.errors import ConfigError
 from zbridge.fleet.printable import as_json as to_json
 from zbridge.fleet.printable import shown
 from zbridge.tasks import occurs, until_signal
+from zbridge.views.rows import RobotRow, as_fields, count_states, read_rows
 from zbridge.views.top.board import Board
 from zbridge.views.top.columns import Order, fit, order_by
-from zbridge.views.top.rows import RobotRow, as_fields, count_states, read_rows
 
 _SUMMED_UP = 2
 """From this number of robots on, a line below the table counts them."""

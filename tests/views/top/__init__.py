@@ -11,7 +11,7 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, FleetMessage, Status
 from zbridge.fleet.processes import ProcessStats, Stats
 from zbridge.fleet.topics import KeySpace, Topic
-from zbridge.views.top.rows import RobotRow, RowState, read_rows
+from zbridge.views.rows import RobotRow, RowState, read_rows
 
 ESTABLISHED = Status("established", protocol="tcpudp", version="1.3", host="hub")
 EVIL = "\x1b[31m[bold]evil[/bold]\nline"

@@ -7,9 +7,9 @@ import pytest
 from rich.cells import cell_len
 
 from tests.views.top import rows
+from zbridge.views.rows import RobotRow, RowState
 from zbridge.views.top.board import NOTICES, Board, Tone, wrap
 from zbridge.views.top.columns import order_by
-from zbridge.views.top.rows import RobotRow, RowState
 
 
 def board(robots: list[RobotRow]) -> Board:

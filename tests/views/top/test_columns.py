@@ -7,8 +7,8 @@ from rich.cells import cell_len
 
 from tests.views.top import rows
 from zbridge.errors import ConfigError
+from zbridge.views.rows import RobotRow, RowState
 from zbridge.views.top.columns import COLUMNS, GAP, IMPORTANCE, fit, order_by, pad
-from zbridge.views.top.rows import RobotRow, RowState
 
 NUMBERS = {"rate": 447.6, "refused": 12, "gaps": 0, "cpu": 0.0451, "memory_bytes": 37_000_000, "driver": "ann@laptop"}
 BY_ROBOT = order_by("robot")

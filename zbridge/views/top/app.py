@@ -16,9 +16,9 @@ from zbridge.client.fleet import Fleet
 from zbridge.client.fleet_model import FleetModel
 from zbridge.client.stops import summarize
 from zbridge.errors import ZbridgeError
+from zbridge.views.rows import read_rows
 from zbridge.views.top.board import Board, Notice, ScreenLine, Tone
 from zbridge.views.top.details import Tables, detail_lines
-from zbridge.views.top.rows import read_rows
 from zbridge.views.top.screens import LinesScreen, PageScreen, QuestionScreen, WithoutStyle
 
 REDRAW_S = 1.0

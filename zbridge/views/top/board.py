@@ -11,8 +11,8 @@ import msgspec
 from rich.cells import cell_len, chop_cells
 
 from zbridge.fleet.printable import shown
+from zbridge.views.rows import RobotRow, RowState, count_states
 from zbridge.views.top.columns import Layout, Order, fit, pad
-from zbridge.views.top.rows import RobotRow, RowState, count_states
 
 NOTICES = 3
 """Most reports that are shown; a further one replaces the oldest."""

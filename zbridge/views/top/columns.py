@@ -14,7 +14,7 @@ import msgspec
 from rich.cells import cell_len, set_cell_size
 
 from zbridge.errors import ConfigError
-from zbridge.views.top.rows import RobotRow
+from zbridge.views.rows import RobotRow
 
 GAP = "  "
 """Between two columns."""

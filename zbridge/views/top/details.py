@@ -8,8 +8,8 @@ from zbridge.client.fleet_model import RobotEntry
 from zbridge.fleet.messages import Latch, LinkStatus, Refusal
 from zbridge.fleet.printable import shown
 from zbridge.fleet.processes import ListenerStats, ProcessStats, SessionEntry, Sessions, Stats
+from zbridge.views.rows import RobotRow
 from zbridge.views.top.board import ScreenLine, Tone
-from zbridge.views.top.rows import RobotRow
 
 Tables = Mapping[tuple[str, str], Sessions]
 """The sessions of processes, by robot and process, as :meth:`zbridge.client.Fleet.processes` returns them."""

@@ -13,7 +13,7 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, Latch, Refusal, Status
 from zbridge.fleet.printable import as_json
 from zbridge.fleet.processes import ProcessStats, Stats
-from zbridge.views.top.rows import RobotRow, RowState, as_fields, count_states
+from zbridge.views.rows import RobotRow, RowState, as_fields, count_states
 
 pytestmark = pytest.mark.jumping
 LATCHED = Control("latched", latches=(Latch(b"1" * 16, "bob", "wet floor"),))

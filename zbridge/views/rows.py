@@ -1,4 +1,4 @@
-"""What ``zbridge top`` shows of each robot, from the fleet model. Text of peers is safe to print."""
+"""One row for each robot of the fleet model, for ``zbridge top`` and the console. Text of peers is safe to print."""
 
 from __future__ import annotations
 

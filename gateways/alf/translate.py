@@ -71,6 +71,7 @@ class AlfRobot(RobotSide):
     """One vehicle, with one link or two; the first link drives."""
 
     hands_over = True
+    takes = ("drive", "light")
     driving: AlfHqRole | None = None
     kept: ClassVar[dict[str, Any]] = {
         "_scanner": messages.ScannerInit | None,
@@ -181,10 +182,6 @@ class AlfRobot(RobotSide):
             self._send(msgspec.structs.replace(self._command, light=command.on), now)
             return Outcome()
         raise Unsupported("an ALF vehicle has no such command")
-
-    @property
-    def takes(self) -> tuple[str, ...]:
-        return ("drive", "light")
 
     def stop(self, now: float, until: float) -> None:
         self._send(self._neutral(), now, urgent=True)

@@ -30,6 +30,7 @@ class KheperaRobot(protocol.RobotSide):
     """One Khepera on one link."""
 
     link_names = ("robot",)
+    takes = ("drive", "light")
 
     def __init__(self, options: Options, links: int = 1, metrics: protocol.Metrics | None = None) -> None:
         self.options = options
@@ -79,10 +80,6 @@ class KheperaRobot(protocol.RobotSide):
         if light is not None:
             self._connected().send(SetLed(0, int(light)))
         return protocol.Outcome(left_out=left_out)
-
-    @property
-    def takes(self) -> tuple[str, ...]:
-        return ("drive", "light")
 
     def stop(self, now: float, until: float) -> None:
         self._drive(SetSpeeds(0, 0), now, period_s=STOP_AGAIN_S, until=until, urgent=True)

@@ -52,6 +52,7 @@ OFFENCES = {
     "Only the certificates import cryptography": ("zbridge/security/roles.py", "import cryptography"),
     "Only the views import what viewers and recordings need": ("zbridge/client/fleet.py", "import foxglove"),
     "Only the screens of top import textual": ("zbridge/views/top/board.py", "import textual"),
+    "Only the console imports starlette and uvicorn": ("zbridge/views/console/feed.py", "import uvicorn"),
     "Only the format of ROS 2 imports rosbags and xxhash": ("zbridge/client/fleet.py", "import xxhash"),
 }
 

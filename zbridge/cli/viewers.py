@@ -1,7 +1,8 @@
-"""``zbridge foxglove, ros2``: serve robots, or a recording, to viewers."""
+"""``zbridge foxglove, console, ros2``: serve robots, or a recording, to viewers."""
 
 from __future__ import annotations
 
+import contextlib
 import gc
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,9 +14,14 @@ from zbridge.bus import BusSettings
 from zbridge.bus.tls.files import own_name, own_role
 from zbridge.cli import run_loop
 from zbridge.cli.options import chosen
+from zbridge.client import joined
+from zbridge.client.fleet import Fleet
+from zbridge.control.latch_store import state_folder
 from zbridge.errors import ConfigError
 from zbridge.metrics import Metrics
+from zbridge.protocol.address import Address
 from zbridge.toml import convert, read_toml
+from zbridge.views.console.roster import Roster
 
 if TYPE_CHECKING:
     from zbridge.views.foxglove.server import ViewerServer
@@ -44,6 +50,27 @@ def run_foxglove(bus: BusSettings, realm: str, file: Path | None, given: dict[st
         run_loop(until_signal(server.serve_live(planned, bus, realm, metrics, ready)))
     else:
         run_loop(until_signal(server.serve_file(planned, file, metrics, ready)))
+
+
+def run_console(bus: BusSettings, realm: str, listen: str, roster: Path | None) -> None:
+    """Serve pages until SIGTERM or SIGINT; raise ZbridgeError. roster: its file, None: the usual one."""
+    try:
+        from zbridge.views.console import server
+    except ImportError as error:
+        raise ConfigError(f"{error}: install the extra: pip install 'zbridge[console]'") from error
+    known = Roster(roster or state_folder() / f"{realm}.roster")
+    known.load()
+    gc.freeze()  # objects made at start-up live as long as the process; the collector skips them
+
+    def ready(address: str) -> None:
+        print(f"console at {address}", flush=True)  # noqa: T201
+
+    async def work() -> None:
+        with contextlib.closing(server.listener(Address.parse(f"tcp://{listen}"))) as listening:
+            async with joined(bus, realm) as session:
+                await server.serve(Fleet(session, realm, own_name(bus.tls)), session, listening, known, ready)
+
+    run_loop(until_signal(work()))
 
 
 def run_ros2(bus: BusSettings | None, default: BusSettings, file: Path | None, given: dict[str, object]) -> None:

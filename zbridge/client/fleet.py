@@ -153,24 +153,30 @@ class Fleet:
         """
         return await self._stop(names, reason, latch=False)
 
-    async def latch(self, names: Iterable[str] | None = None, reason: str | None = None) -> dict[str, Outcome]:
+    async def latch(
+        self, names: Iterable[str] | None = None, reason: str | None = None, *, also: Iterable[str] = ()
+    ) -> dict[str, Outcome]:
         """Stop them as :meth:`stop` does, and prevent driving until they are released.
+
+        also: robots that must confirm a stop of all, even if they have no gateway now.
 
         A stop of all robots latches the whole fleet: gateways that start later learn of it, and :meth:`unlatch`
         releases it. Named robots are released one by one with :meth:`Robot.unlatch`.
         """
-        return await self._stop(names, reason, latch=True)
+        return await self._stop(names, reason, latch=True, also=also)
 
     async def unlatch(self) -> dict[str, Outcome]:
         """Release the latched stops of the whole fleet; return for each robot the error, None if it was released."""
         names = filter(is_name, await settled(self._gateways, lambda seen: seen))
         return await stops.unlatch_fleet(self._bus, self.realm, names, self._own)
 
-    async def _stop(self, names: Iterable[str] | None, reason: str | None, *, latch: bool) -> dict[str, Outcome]:
+    async def _stop(
+        self, names: Iterable[str] | None, reason: str | None, *, latch: bool, also: Iterable[str] = ()
+    ) -> dict[str, Outcome]:
         stop = stops.new_stop(self._own, reason, latch=latch, secret=self._secret)
         if names is None:
             await stops.put_stop(self._bus, KeySpace(self.realm, "*"), stop)
-            names = filter(is_name, await settled(self._gateways, lambda seen: seen))
+            names = {*filter(is_name, await settled(self._gateways, lambda seen: seen)), *also}
         names = [names] if isinstance(names, str) else names
         return await stops.stop_robots(self._bus, self.realm, names, stop)
 

@@ -1,0 +1,140 @@
+"""STOP ALL of the console against real gateways in trouble: the sentence is true each time, and Release gives back."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from websockets.sync.client import ClientConnection, connect
+
+from tests.e2e.conftest import HOST, Bench, Gateway, device, end, until
+
+CONFIRMED = "stopped (their gateways sent it)"
+ROBOTS = {"a1": "alf", "t1": "tcpudp", "w1": "wc2ec"}
+
+
+class Page:
+    """A page of the console: what it was told, all put together."""
+
+    def __init__(self, opened: ClientConnection) -> None:
+        self._opened = opened
+        self.rows: dict[str, dict[str, Any]] = {}
+        self.notice: dict[str, Any] = {}
+
+    def until(self, condition: Callable[[], Any], what: str, timeout_s: float = 20.0) -> None:
+        """Read until a condition is met."""
+
+        def read() -> Any:
+            with contextlib.suppress(TimeoutError):
+                self._note(json.loads(self._opened.recv(timeout=0.1)))
+            return condition()
+
+        until(read, timeout_s, what)
+
+    def ask(self, do: str, robot: str = "") -> str:
+        """Ask for something; give the sentence that comes of it."""
+        before = time.time()
+        self._opened.send(json.dumps({"do": do, "robot": robot}))
+        self.until(lambda: self.notice.get("good") is not None and self.notice["at"] > before, f"what came of {do}")
+        return str(self.notice["text"])
+
+    def states(self) -> dict[str, str]:
+        return {name: row["state"] for name, row in self.rows.items()}
+
+    def _note(self, message: dict[str, Any]) -> None:
+        if message.get("full"):
+            self.rows.clear()
+        self.rows.update({row["name"]: row for row in message.get("rows", ())})
+        for name in message.get("gone", ()):
+            self.rows.pop(name, None)
+        self.notice = message.get("notice") or self.notice
+
+
+class Scene:
+    """A robot of each protocol behind its gateway, and the console with a page."""
+
+    def __init__(self, bench: Bench, stack: contextlib.ExitStack) -> None:
+        self.bench, self.simulators, self.gateways = bench, dict[str, int](), dict[str, Gateway]()
+        for robot, protocol in ROBOTS.items():
+            port = self.simulators[robot] = bench.simulator(protocol)
+            self.gateways[robot] = bench.gateway(device(port, protocol), robot=robot)
+        command = ("console", "--listen", f"{HOST}:0", "--roster", str(bench.folder / "roster"))
+        self.console = bench.zbridge(*command, "--connect", bench.endpoint)
+        assert self.console.stdout is not None
+        at = self.console.stdout.readline().split()[-1]
+        opened = connect(f"ws{at.removeprefix('http')}/socket", origin=at, proxy=None)  # type: ignore[arg-type]
+        self.page = Page(stack.enter_context(opened))
+        self.page.until(lambda: self.page.states() == dict.fromkeys(ROBOTS, "established"), "all robots", 30.0)
+
+    def freeze(self, pid: int) -> None:
+        """Stop a process until the end of the test."""
+        os.kill(pid, signal.SIGSTOP)
+        self.bench.stack.callback(_thaw, pid)
+
+
+def _thaw(pid: int) -> None:
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(pid, signal.SIGCONT)
+
+
+@pytest.fixture
+def scene(bench: Bench) -> Iterator[Scene]:
+    with contextlib.ExitStack() as stack:
+        yield Scene(bench, stack)
+
+
+def test_all_are_stopped_and_released_and_the_console_ends_orderly(scene: Scene) -> None:
+    page = scene.page
+    assert page.ask("stop_all") == f"3 of 3 {CONFIRMED}"
+    page.until(lambda: set(page.states().values()) == {"LATCHED"}, "all latched")
+    assert page.ask("release") == "3 of 3 released"
+    page.until(lambda: set(page.states().values()) == {"established"}, "all released")
+    assert page.ask("stop", "t1") == "t1 stopped (its gateway sent it)"
+    end(scene.console)
+    assert scene.console.returncode == 0
+
+
+def test_a_killed_gateway_is_missing_a_frozen_one_confirms_nothing_and_a_robot_is_away(scene: Scene) -> None:
+    page = scene.page
+    scene.gateways["t1"].signal(signal.SIGKILL)
+    scene.freeze(scene.gateways["w1"].process.pid)
+    scene.bench.simulators[scene.simulators["a1"]].kill()
+    page.until(lambda: page.states()["t1"] == "NO GATEWAY", "t1 missing")
+    page.until(lambda: page.states()["w1"] == "SILENT", "w1 silent")
+    page.until(lambda: page.states()["a1"] in ("offline", "connecting"), "a1 away")
+    first, *parts = page.ask("stop_all").split("; ")
+    assert first == f"0 of 3 {CONFIRMED}"
+    assert set(parts) == {
+        "a1 away",
+        "t1 without a gateway, which nothing can stop from here",
+        "w1 not confirmed",
+    }
+
+
+def test_a_frozen_robot_is_not_said_to_have_stopped_before_its_link_takes_the_stop(scene: Scene) -> None:
+    page = scene.page
+    scene.freeze(scene.bench.simulators[scene.simulators["a1"]].pid)
+    text = page.ask("stop_all")
+    assert "3 of 3" in text or "a1" in text, "its kernel may have taken the bytes: then the gateway has sent it"
+    assert text.startswith(("3 of 3", "2 of 3"))
+
+
+def test_a_robot_that_was_seen_by_an_earlier_console_is_missing_in_the_next(scene: Scene) -> None:
+    bench = scene.bench
+    end(scene.console)
+    scene.gateways["w1"].end()
+    command = ("console", "--listen", f"{HOST}:0", "--roster", str(bench.folder / "roster"))
+    console = bench.zbridge(*command, "--connect", bench.endpoint)
+    assert console.stdout is not None
+    at = console.stdout.readline().split()[-1]
+    with connect(f"ws{at.removeprefix('http')}/socket", origin=at, proxy=None) as opened:  # type: ignore[arg-type]
+        page = Page(opened)
+        page.until(lambda: page.states().get("w1") == "NO GATEWAY", "w1 missing")
+        assert "w1 without a gateway" in page.ask("stop_all")
+    end(console)

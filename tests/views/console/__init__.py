@@ -1,0 +1,1 @@
+"""The console: what it says, and to whom."""

@@ -1,0 +1,185 @@
+"""The console's server on a real socket: what it serves, whom it refuses, and what a slow page costs."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import http.client
+import json
+import socket
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from tests.client import World
+from tests.ports import HOST
+from zbridge.errors import LinkError
+from zbridge.protocol.address import Address
+from zbridge.views.console import page, server
+from zbridge.views.console.roster import Roster
+
+CONFIRMED = "stopped (their gateways sent it)"
+
+
+class Scene:
+    """Two robots, and a console for them."""
+
+    def __init__(self, world: World, at: str, roster: Roster) -> None:
+        self.world, self.at, self.roster = world, at.removeprefix("http://"), roster
+
+    async def get(self, path: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
+        """Get a path over a connection of its own."""
+
+        def ask() -> tuple[int, dict[str, str], bytes]:
+            connection = http.client.HTTPConnection(self.at, timeout=5)
+            with contextlib.closing(connection):
+                connection.request("GET", path, headers={"Host": self.at, **headers})
+                answer = connection.getresponse()
+                return answer.status, {name.lower(): value for name, value in answer.getheaders()}, answer.read()
+
+        return await asyncio.to_thread(ask)
+
+    @contextlib.asynccontextmanager
+    async def page(self, **options: Any) -> AsyncIterator[ClientConnection]:
+        """Open a socket as a page of the console does."""
+        options = {"origin": f"http://{self.at}", "proxy": None, **options}
+        async with connect(f"ws://{self.at}/socket", **options) as opened:
+            yield opened
+
+
+def states(message: dict[str, Any]) -> list[tuple[str, str]]:
+    return [(row["name"], row["state"]) for row in message.get("rows", ())]
+
+
+@pytest.fixture
+async def scene(tmp_path: Path) -> AsyncIterator[Scene]:
+    world, roster = World("r1", "r2"), Roster(tmp_path / "fleet.roster")
+    served: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+    with contextlib.closing(server.listener(Address(HOST, 0))) as listening:
+        serving = asyncio.create_task(
+            server.serve(world.fleet, world.bus.join("console"), listening, roster, served.set_result)
+        )
+        try:
+            yield Scene(world, await served, roster)
+        finally:
+            serving.cancel()
+            await asyncio.gather(serving, return_exceptions=True)
+
+
+async def until(opened: ClientConnection, condition: Callable[[dict[str, Any]], Any]) -> dict[str, Any]:
+    """Read messages until one meets a condition."""
+    async with asyncio.timeout(10):
+        while True:
+            message: dict[str, Any] = json.loads(await opened.recv())
+            if condition(message):
+                return message
+
+
+async def test_a_page_gets_all_robots_and_what_has_come_of_a_stop(scene: Scene) -> None:
+    async with scene.page() as opened, scene.page() as other:
+        first = await until(opened, lambda message: len(message.get("rows", ())) == 2)
+        assert sorted(row["name"] for row in first["rows"]) == ["r1", "r2"]
+        await opened.send(json.dumps({"do": "stop_all"}))
+        assert (await until(opened, lambda message: message.get("notice")))["notice"]["good"] is None
+        done = await until(other, lambda message: (message.get("notice") or {}).get("good") is not None)
+        assert done["notice"]["text"] == f"2 of 2 {CONFIRMED}"
+        assert {gateway.control.state for gateway in scene.world.gateways.values()} == {"latched"}
+        await until(opened, lambda message: all(row["latched"] for row in message.get("rows", [{"latched": 0}])))
+        late = scene.page()
+        async with late as opened_late:
+            snapshot = await until(opened_late, lambda message: message.get("full"))
+            assert snapshot["notice"]["text"] == f"2 of 2 {CONFIRMED}"
+
+
+async def test_one_robot_is_stopped_and_the_other_one_is_not(scene: Scene) -> None:
+    async with scene.page() as opened:
+        await opened.send(json.dumps({"do": "stop", "robot": "r2"}))
+        done = await until(opened, lambda message: (message.get("notice") or {}).get("good") is not None)
+    assert done["notice"]["text"] == "r2 stopped (its gateway sent it)"
+    assert scene.world.gateways["r2"].machine.stops
+    assert not scene.world.gateways["r1"].machine.stops
+
+
+async def test_a_robot_that_was_there_is_missing_until_it_is_forgotten(scene: Scene, tmp_path: Path) -> None:
+    async with scene.page() as opened:
+        await until(opened, lambda message: len(message.get("rows", ())) == 2)
+        await scene.world.gateways["r2"].vanish()
+        await until(opened, lambda message: ("r2", "NO GATEWAY") in states(message))
+        assert (tmp_path / "fleet.roster").read_text() == "r1\nr2\n"
+        await opened.send(json.dumps({"do": "forget", "robot": "r1"}))  # it is there
+        await opened.send(json.dumps({"do": "forget", "robot": "r2"}))
+        assert (await until(opened, lambda message: message.get("gone")))["gone"] == ["r2"]
+
+
+@pytest.mark.parametrize("origin", [None, "http://evil.example", "http://127.0.0.1:1", "https://127.0.0.1", "null"])
+async def test_a_socket_of_another_page_is_refused(scene: Scene, origin: str | None) -> None:
+    with pytest.raises(InvalidStatus) as refused:
+        async with scene.page(origin=origin):
+            pytest.fail("it was accepted")
+    assert refused.value.response.status_code == 403
+
+
+async def test_a_name_that_somebody_elses_dns_turns_here_is_refused(scene: Scene) -> None:
+    for path in ("/", "/static/app.js"):
+        status, _, _ = await scene.get(path, Host=f"evil.example:{scene.at.rpartition(':')[2]}")
+        assert status == 403
+    status, _, _ = await scene.get("/", Host=f"localhost:{scene.at.rpartition(':')[2]}")
+    assert status == 200
+
+
+async def test_every_answer_forbids_what_a_page_of_ours_does_not_need(scene: Scene) -> None:
+    for path in ("/", "/static/app.js", "/static/vendor/htm-preact.js", "/nothing"):
+        _, headers, _ = await scene.get(path)
+        policy = headers["content-security-policy"]
+        assert "default-src 'none'" in policy
+        assert "unsafe" not in policy
+        assert (headers["x-content-type-options"], headers["cache-control"]) == ("nosniff", "no-cache")
+
+
+async def test_files_beside_the_pages_are_not_served(scene: Scene) -> None:
+    for path in ("/static/../server.py", "/static/%2e%2e/server.py", "/static/..%2fserver.py", "/server.py"):
+        assert (await scene.get(path))[0] == 404
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", '{"do": "drive"}', '{"do": "stop", "more": 1}', "x" * (page.MOST_BYTES + 1)]
+)
+async def test_a_page_that_sends_what_it_must_not_is_closed_and_others_stay(scene: Scene, text: str) -> None:
+    async with scene.page() as good, scene.page() as bad:
+        await bad.send(text)
+        with pytest.raises(ConnectionClosed):
+            await until(bad, lambda message: False)
+        await good.send(json.dumps({"do": "stop", "robot": "r1"}))
+        await until(good, lambda message: (message.get("notice") or {}).get("good"))
+
+
+async def test_there_are_no_more_pages_than_fit(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, "PAGES", 1)
+    async with scene.page() as first:
+        await until(first, lambda message: message.get("full"))
+        with pytest.raises(InvalidStatus):
+            async with scene.page():
+                pytest.fail("it was accepted")
+    async with asyncio.timeout(5):
+        while True:
+            with contextlib.suppress(InvalidStatus):
+                async with scene.page() as next_one:
+                    await until(next_one, lambda message: message.get("full"))
+                    return
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "192.168.0.2", "::", "example.org"])
+def test_it_listens_on_loopback_only(host: str) -> None:
+    with pytest.raises(LinkError, match="loopback only"):
+        server.listener(Address(host, 0))
+
+
+def test_a_port_that_is_taken_is_an_error_that_names_it() -> None:
+    with socket.create_server((HOST, 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(LinkError, match=str(port)):
+            server.listener(Address(HOST, port))

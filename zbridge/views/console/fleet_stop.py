@@ -1,0 +1,134 @@
+"""Stops the whole fleet, and says what came of it: what gateways confirmed, and what robots show of themselves since.
+
+A confirmed stop is a stop that the robot's gateway has sent. Whether the robot obeys is another matter: its own pose
+and speed are watched for a second after it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+from collections.abc import Collection, Iterable, Mapping
+
+import msgspec
+
+from zbridge.bus import Bus, Sample
+from zbridge.client.fleet import Fleet
+from zbridge.client.stops import Outcome, StopWaits
+from zbridge.errors import NotReady, PayloadError, Refused
+from zbridge.fleet import payload as payloads
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Motion, Pose
+from zbridge.fleet.topics import is_name, split_key
+
+ROLL_OUT_S = 0.5
+"""Seconds for which a robot that was stopped may roll out."""
+WATCH_S = 1.0
+"""Seconds for which robots are watched then."""
+STILL = 0.02
+"""Speed, as a fraction of full scale, and metres, up to which a robot is at rest."""
+STILL_RAD = 0.05
+ROBOTS = 10_000
+"""Most robots that are watched."""
+NAMED = 20
+"""Most robots that a part of the sentence names."""
+
+
+class StopReport(msgspec.Struct, frozen=True):
+    """What came of a stop of the fleet. text: one sentence, for people. good: whether nothing is left to be done."""
+
+    text: str
+    good: bool
+
+
+async def stop_fleet(fleet: Fleet, bus: Bus, roster: Iterable[str], alive: Collection[str]) -> StopReport:
+    """Latch the whole fleet; report what was confirmed, and who moves nevertheless.
+
+    roster: robots that must be among those on the bus. alive: the robots that have a gateway, as it changes.
+    """
+    stopping = asyncio.create_task(fleet.latch(None, "STOP ALL in the console", also=roster))
+    with contextlib.closing(MovementWatch(bus, fleet.realm)) as watch:  # the stop goes first
+        outcomes = await stopping
+        await asyncio.sleep(ROLL_OUT_S)
+        watch.begin()
+        await asyncio.sleep(WATCH_S)
+        return judge(outcomes, watch.moving(), alive)
+
+
+def judge(outcomes: Mapping[str, Outcome], moving: Collection[str], alive: Collection[str]) -> StopReport:
+    """Say what came of a stop: ``38 of 40 stopped (their gateways sent it); r7 away; r9 not confirmed``."""
+    if not outcomes:
+        return StopReport("No robot is known: the stop was sent to all, and nobody confirmed it", good=False)
+    failed: dict[str, list[str]] = {}
+    for name, error in outcomes.items():
+        if error is not None:
+            failed.setdefault(_finding(name, error, alive), []).append(name)
+    confirmed = sum(error is None for error in outcomes.values())
+    parts = [f"{confirmed} of {len(outcomes)} stopped (their gateways sent it)"]
+    parts += [f"{_names(names)} {finding}" for finding, names in failed.items()]
+    if moving:
+        how = "move by their" if len(moving) > 1 else "moves by its"
+        parts.append(f"{_names(sorted(moving))} still {how} own pose or speed")
+    return StopReport("; ".join(parts), good=not failed and not moving)
+
+
+def _finding(name: str, error: Exception, alive: Collection[str]) -> str:
+    if isinstance(error, StopWaits):
+        return "not reached yet: its link is stalled"
+    if name not in alive:
+        return "without a gateway, which nothing can stop from here"
+    if isinstance(error, NotReady):
+        return "away"
+    return "refused it" if isinstance(error, Refused) else "not confirmed"
+
+
+def _names(names: Collection[str]) -> str:
+    named = list(names)[:NAMED]
+    return ", ".join(named) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
+
+
+class MovementWatch:
+    """Which robots move, by their own pose or speed. Keeps two samples of each key, and reads them in the end only."""
+
+    def __init__(self, bus: Bus, realm: str) -> None:
+        self._samples: dict[str, tuple[Sample, Sample]] = {}
+        self._handles = [
+            bus.subscribe(f"{realm}/*/{path}", self._take) for path in (topics.POSE.path, topics.MOTION.path)
+        ]
+
+    def __repr__(self) -> str:
+        return f"<MovementWatch {len(self._samples)} keys>"
+
+    def close(self) -> None:
+        """Watch nothing any more; idempotent."""
+        while self._handles:
+            self._handles.pop().close()
+
+    def begin(self) -> None:
+        """Forget what was seen so far."""
+        self._samples.clear()
+
+    def moving(self) -> set[str]:
+        """Return the robots that move, by the first and the last sample since :meth:`begin`."""
+        found = set()
+        for key, (first, last) in self._samples.items():
+            split = split_key(key)
+            with contextlib.suppress(PayloadError):
+                if split is not None and is_name(split[1]) and _moves(split[2], first, last):
+                    found.add(split[1])
+        return found
+
+    def _take(self, sample: Sample) -> None:
+        known = self._samples.get(sample.key)
+        if known is not None or len(self._samples) < 2 * ROBOTS:
+            self._samples[sample.key] = (known[0] if known is not None else sample, sample)
+
+
+def _moves(path: str, first: Sample, last: Sample) -> bool:
+    if path == topics.MOTION.path:
+        speed = payloads.decode(Motion, last.payload).speed
+        return speed is not None and abs(speed) > STILL
+    begin, end = payloads.decode(Pose, first.payload), payloads.decode(Pose, last.payload)
+    turned = math.remainder(end.heading - begin.heading, math.tau)
+    return math.hypot(end.x - begin.x, end.y - begin.y) > STILL or abs(turned) > STILL_RAD

@@ -1,0 +1,37 @@
+// The console's pages. The part of the address behind # says which: nothing, or /robot/<name>.
+
+import { html, render } from "./vendor/htm-preact.js";
+import { Fleet } from "./fleet.js";
+import { Robot } from "./robot.js";
+import { Header } from "./header.js";
+import { Store } from "./store.js";
+
+let scheduled = false;
+
+function draw() {
+  if (scheduled) return;
+  scheduled = true;
+  requestAnimationFrame(() => {
+    scheduled = false;
+    const name = location.hash.startsWith("#/robot/") ? decodeURIComponent(location.hash.slice(8)) : null;
+    document.title = `${name ?? store.realm ?? "fleet"} - zbridge console`;
+    const page = name === null ? html`<${Fleet} store=${store} />` : html`<${Robot} store=${store} name=${name} />`;
+    render(html`<${Header} store=${store} /><main>${page}</main>`, document.body);
+  });
+}
+
+const store = new Store(draw);
+addEventListener("hashchange", draw);
+addEventListener("resize", draw);
+// Escape stops wherever the page receives it: before any control does.
+addEventListener(
+  "keydown",
+  (event) => {
+    if (event.key === "Escape" && !event.repeat) {
+      event.preventDefault();
+      store.stopAll();
+    }
+  },
+  { capture: true },
+);
+draw();

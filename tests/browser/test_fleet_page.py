@@ -1,0 +1,163 @@
+"""The fleet page: every state of a robot is drawn, STOP ALL is always there, and Escape stops wherever the focus is."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from tests.browser.conftest import NARROW, WIDE, Browser, Feed, row
+
+EVIL = "<img src=x onerror=alert(1)>"
+STATES = [
+    row("away", "offline", 2, reason="connection refused", rate=None, commands=[]),
+    row("busy", "established", reason="busy: it saves its map"),
+    row("evil", "established", reason=EVIL, driver=EVIL, protocol=EVIL, host=EVIL),
+    row("free"),
+    row("held", driver="ann@desk"),
+    row("hung", "SILENT", 1, rate=None, seen=1_700_000_000, commands=[]),
+    row("killed", "NO GATEWAY", 0, protocol="", version="", rate=None, refused=None, gaps=None, commands=[]),
+    row("latched", "LATCHED", 8, latched=["latched by ann (wet floor)"], driver="LATCHED"),
+    row("long", reason="x" * 10_000, driver="y" * 10_000),
+    row("stalled", "stalled", 3, reason="its link acknowledges nothing"),
+    row("stopped", driver="stopped"),
+    row("unknown", "unknown", 7, rate=None),
+]
+NOBODY_ANSWERS = """() => {
+  window.Real = WebSocket;
+  WebSocket = class { constructor() { setTimeout(() => this.onclose(), 10); } };
+}"""
+CONTROLS = ["Filter robots", "established 6", "tcpudp 10", "Stop free", "Forget killed", "free", "zbridge fleet"]
+
+
+async def soon(condition: Callable[[], Any]) -> None:
+    async with asyncio.timeout(10):
+        while not condition():  # noqa: ASYNC110
+            await asyncio.sleep(0.02)
+
+
+@pytest.mark.parametrize(("size", "scheme"), [(WIDE, "light"), (NARROW, "dark")])
+async def test_every_state_of_a_robot_is_drawn_without_a_complaint_and_nothing_is_wider_than_the_page(
+    browser: Browser, size: Any, scheme: str
+) -> None:
+    page = await browser.open(feed=Feed(*STATES), size=size, scheme=scheme)
+    await page.locator(".tall .row").first.wait_for()
+    seen = set()
+    for top in range(0, 92 * len(STATES), 300):
+        await page.evaluate("top => document.querySelector('.box').scrollTop = top", top)
+        await page.wait_for_timeout(100)
+        seen |= set(await page.locator(".tall .name").all_inner_texts())
+    assert seen == {each["name"] for each in STATES}
+    assert await page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert await page.locator("img").count() == 0
+    await page.get_by_role("link", name="free").click()
+    assert "stop, drive" in await page.locator("dl").inner_text()
+    assert browser.complaints == []
+
+
+async def test_of_200_robots_those_in_sight_are_drawn_and_each_is_found(browser: Browser) -> None:
+    page = await browser.open(feed=Feed(*(row(f"r{number}", protocol="alf") for number in range(200))))
+    await page.locator(".tall .row").first.wait_for()
+    assert await page.locator(".tall .row").count() < 40
+    await page.get_by_label("Filter robots").fill("r199")
+    assert await page.locator(".tall .name").all_inner_texts() == ["r199"]
+    await page.get_by_label("Filter robots").fill("r199 tcpudp")
+    assert "No robot matches" in await page.locator(".empty").inner_text()
+    assert browser.complaints == []
+
+
+async def test_filters_by_state_and_protocol_are_buttons_that_are_pressed(browser: Browser) -> None:
+    page = await browser.open(feed=Feed(row("r1"), row("r2", protocol="alf"), row("r3", "offline", 2)))
+    await page.get_by_role("button", name="alf 1").click()
+    assert await page.locator(".tall .name").all_inner_texts() == ["r2"]
+    assert await page.get_by_role("button", name="alf 1").get_attribute("aria-pressed") == "true"
+    await page.get_by_role("button", name="alf 1").click()
+    await page.get_by_role("button", name="offline 1").click()
+    assert await page.locator(".tall .name").all_inner_texts() == ["r3"]
+
+
+async def test_stop_all_is_in_sight_on_every_page_and_a_click_leaves_it_without_the_focus(browser: Browser) -> None:
+    feed = Feed(*STATES)
+    page = await browser.open(feed=feed, size=NARROW)
+    for path in ("", "#/robot/free", "#/robot/nobody"):
+        await page.goto(f"{browser.at}/{path}")
+        button = page.get_by_role("button", name="STOP ALL", exact=True)
+        assert await button.is_visible()
+        box = await button.bounding_box()
+        assert box["y"] + box["height"] < NARROW["height"] / 2
+        before = len(feed.asked)
+        await button.click()
+        await soon(lambda: len(feed.asked) > before)  # noqa: B023
+        await page.keyboard.press("Space")
+        await page.keyboard.press("Enter")
+        await page.wait_for_timeout(100)
+        assert feed.asked[before:] == [{"do": "stop_all"}]
+
+
+async def test_escape_stops_whatever_has_the_focus_and_once_for_each_press(browser: Browser) -> None:
+    feed = Feed(*STATES)
+    page = await browser.open(feed=feed, size={"width": 1200, "height": 900})
+    await page.locator(".tall .row").first.wait_for()
+    for number, name in enumerate(CONTROLS, 1):
+        control = page.get_by_label(name, exact=True).or_(page.get_by_text(name, exact=True)).first
+        focusable = control if name not in ("established 6", "tcpudp 10") else page.get_by_role("button", name=name)
+        await focusable.focus()
+        await page.keyboard.press("Escape")
+        await soon(lambda: len(feed.asked) >= number)  # noqa: B023
+    await page.get_by_label("Filter robots").focus()
+    await page.evaluate("dispatchEvent(new KeyboardEvent('keydown', {key: 'Escape', repeat: true}))")
+    await page.wait_for_timeout(100)
+    assert feed.asked == [{"do": "stop_all"}] * len(CONTROLS)
+
+
+async def test_release_asks_once_more_and_only_where_a_robot_is_latched(browser: Browser) -> None:
+    feed = Feed(row("r1"))
+    page = await browser.open(feed=feed)
+    await page.locator(".tall .row").first.wait_for()
+    assert await page.get_by_role("button", name="Release").count() == 0
+    feed.tell(rows=[row("r1", "LATCHED", 8, latched=["latched"])])
+    await page.get_by_role("button", name="Release").click()
+    assert feed.asked == []
+    assert "1 robot may be driven again?" in await page.locator(".question").inner_text()
+    await page.get_by_role("button", name="Cancel").click()
+    await page.get_by_role("button", name="Release").click()
+    await page.get_by_role("button", name="Release").click()
+    await soon(lambda: feed.asked)
+    assert feed.asked == [{"do": "release"}]
+
+
+async def test_one_robot_is_stopped_or_forgotten_by_its_row(browser: Browser) -> None:
+    feed = Feed(*STATES)
+    page = await browser.open(feed=feed, size={"width": 1200, "height": 900})
+    await page.get_by_role("button", name="Stop free").click()
+    await page.get_by_role("button", name="Forget killed").click()
+    await soon(lambda: len(feed.asked) == 2)
+    assert feed.asked == [{"do": "stop", "robot": "free"}, {"do": "forget", "robot": "killed"}]
+
+
+async def test_a_console_that_does_not_answer_is_said_and_a_stop_is_sent_when_it_does_again(browser: Browser) -> None:
+    feed = Feed(row("r1"))
+    page = await browser.open(feed=feed)
+    await page.locator(".tall .row").first.wait_for()
+    await page.evaluate(NOBODY_ANSWERS)
+    await feed.close()
+    await page.get_by_text("does not answer: what is shown is old").wait_for()
+    await page.keyboard.press("Escape")
+    await page.get_by_text("STOP ALL was NOT sent").wait_for()
+    assert feed.asked == []
+    await page.evaluate("() => { WebSocket = window.Real; }")
+    await soon(lambda: feed.asked)
+    assert feed.asked == [{"do": "stop_all"}]
+
+
+async def test_a_notice_is_read_out_and_hostile_text_stays_text(browser: Browser) -> None:
+    feed = Feed(row("r1"), notice={"text": EVIL, "at": 1_700_000_000, "good": False})
+    page = await browser.open(feed=feed)
+    status = page.get_by_role("status")
+    assert EVIL in await status.inner_text()
+    assert await status.get_attribute("aria-live") == "assertive"
+    feed.tell(bus=False)
+    await page.get_by_text("The bus is lost").wait_for()
+    assert browser.complaints == []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import re
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -106,6 +107,8 @@ NAMES = "expected letters, digits, '_', '.' and '-' only"
 CLOSED = "--connect tcp/127.0.0.1:1"
 """Nobody listens there."""
 WRONG: list[tuple[str, int, str]] = [
+    ("console --listen nonsense", 2, "--listen 'nonsense': expected host:port"),
+    ("console --listen 0.0.0.0:80", 2, "loopback only"),
     # what is typed
     ("frobnicate", 2, "No such command 'frobnicate'"),
     ("--frobnicate", 2, "No such option: --frobnicate"),
@@ -261,8 +264,10 @@ def test_an_interruption_ends_a_command_without_a_traceback(early: bool) -> None
     """Early: while modules are loaded; then while the bus is joined."""
     code = "import sys, zbridge.__main__\nprint(flush=True)\n"
     code += "" if early else "import zbridge.cli.app, zbridge.cli.bus, zbridge.bus.zenoh\nprint(flush=True)\n"
-    code += "sys.argv = ['zbridge', 'ls', '--realm', 'nobodys']\nzbridge.__main__.main()\n"
-    with subprocess.Popen((sys.executable, "-c", code), cwd=ROOT, stdout=-1, stderr=-1, text=True) as process:
+    silent = socket.create_server(("127.0.0.1", 0))  # whoever connects waits for an answer
+    code += f"sys.argv = ['zbridge', 'ls', '--connect', 'tcp/127.0.0.1:{silent.getsockname()[1]}']\n"
+    code += "zbridge.__main__.main()\n"
+    with silent, subprocess.Popen((sys.executable, "-c", code), cwd=ROOT, stdout=-1, stderr=-1, text=True) as process:
         assert process.stdout is not None
         for _ in range(1 if early else 2):
             process.stdout.readline()

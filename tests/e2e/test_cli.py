@@ -6,6 +6,7 @@ import json
 import signal
 import subprocess
 import sys
+import urllib.request
 from pathlib import Path
 from typing import Any
 
@@ -141,6 +142,7 @@ def test_the_secure_demo_drives_its_robots_by_roles_and_ends_with_0() -> None:
     shown = zbridge("demo", "--secure", "--seconds", "8", timeout_s=120.0)  # nine processes start, one by one
     assert (shown.returncode, shown.stderr) == (0, "")
     assert "router at tls/127.0.0.1:" in shown.stdout
+    assert "in a browser, with STOP ALL: http://127.0.0.1:" in shown.stdout
     for protocol in protocol_names():
         assert f"{protocol}1" in shown.stdout
     assert "established" in shown.stdout  # the viewer sees
@@ -150,9 +152,14 @@ def test_the_secure_demo_drives_its_robots_by_roles_and_ends_with_0() -> None:
 def test_the_demo_interrupted_leaves_no_process_behind() -> None:
     demo = start("demo")
     assert demo.stdout is not None
-    until(lambda: "router at" in (demo.stdout.readline() if demo.stdout else ""))
+    line = ""
+    while "the fleet in a browser" not in line:
+        line = demo.stdout.readline()
+        assert line, "it has ended"
+    with urllib.request.urlopen(line.split()[-1], timeout=10) as page:
+        assert b"zbridge console" in page.read()
     children = Path(f"/proc/{demo.pid}/task/{demo.pid}/children").read_text().split()
-    assert len(children) == 2 * len(protocol_names())
+    assert len(children) == 2 * len(protocol_names()) + 1
     end(demo, signal.SIGINT, within_s=20.0)  # seven processes; what counts is that none is left
     assert demo.returncode == 0
     until(lambda: not any(Path(f"/proc/{child}").exists() for child in children), what="the end of all")

@@ -294,6 +294,9 @@ def demo(
         bool,
         typer.Option("--secure", help="use mutual TLS with generated certificates; needs zbridge[certs]"),
     ] = False,
+    console: Annotated[
+        bool, typer.Option("--console", help="open the console in a browser; needs zbridge[console]")
+    ] = False,
 ) -> None:
     """Show a simulated robot of each protocol, their gateways, a router and a live table; loopback only.
 
@@ -301,7 +304,7 @@ def demo(
     """
     from zbridge.cli.demo import run_demo
 
-    run_command(run_demo(seconds, secure=secure), level=logging.WARNING)
+    run_command(run_demo(seconds, secure=secure, console=console), level=logging.WARNING)
 
 
 @app.command()

@@ -11,6 +11,7 @@ import itertools
 import math
 import sys
 import tempfile
+import webbrowser
 from collections import Counter
 from collections.abc import AsyncIterator
 from importlib.util import find_spec
@@ -101,11 +102,14 @@ class LiveTable:
         return table
 
 
-async def run_demo(seconds: float, *, secure: bool = False) -> None:
+async def run_demo(seconds: float, *, secure: bool = False, console: bool = False) -> None:
     """Show the demo for ``seconds`` (0: until interrupted); raise ZbridgeError if a robot sent no data.
 
-    secure: on mutual TLS, with roles; raises ConfigError if no certificates can be made.
+    secure: on mutual TLS, with roles; raises ConfigError if no certificates can be made. console: open the console in a
+    browser; raises ConfigError if its extra is not installed.
     """
+    if console and not _has_console():
+        raise ConfigError("--console: install the extra: pip install 'zbridge[console]'")
     robots = {f"{name}1": name for name in protocol_names() if _is_whole(name)}
     watch = LiveTable(list(robots))
     async with contextlib.AsyncExitStack() as stack:
@@ -129,6 +133,11 @@ async def run_demo(seconds: float, *, secure: bool = False) -> None:
             "HQ programs connect to the robots here; to simulate one:",
             *(f"  {name}: {_how_to_connect(find_protocol(robots[name]), listeners[name])}" for name in watch.rows),
         ]
+        if _has_console():
+            at = await stack.enter_async_context(_console(folder, log, bus.joins))
+            how.append(f"the fleet in a browser, with STOP ALL: {at}")
+            if console:
+                webbrowser.open(at)
         await until_signal(_show(bus.operator, watch, seconds, how))
         await end([gateway for _, gateway in processes])  # all at once: each needs about a second to stop its robot
         await end([simulator for simulator, _ in processes])
@@ -137,6 +146,23 @@ async def run_demo(seconds: float, *, secure: bool = False) -> None:
             for line in (folder / "log").read_text(errors="replace")[-2000:].splitlines():
                 print(shown(line), file=sys.stderr)  # noqa: T201
             raise ZbridgeError(f"{'; '.join(failed)}; the end of the processes' log is above")
+
+
+def _has_console() -> bool:
+    return all(find_spec(module) is not None for module in ("starlette", "uvicorn", "websockets"))
+
+
+@contextlib.asynccontextmanager
+async def _console(folder: Path, log: IO[bytes], joins: tuple[str, ...]) -> AsyncIterator[str]:
+    """Run the console while the context lasts; yield its address, or why it has none. joins: how it joins the bus."""
+    options = ("--listen", "127.0.0.1:0", "--roster", str(folder / "roster"))
+    async with process(log, "console", *options, *joins, read=True) as console:
+        assert console.stdout is not None
+        line = b""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(START_S):
+                line = await console.stdout.readline()
+        yield line.decode().rpartition(" ")[2].strip() or "it did not start"
 
 
 def _left_out(error: ZbridgeError) -> str:
@@ -175,7 +201,7 @@ async def _open_to_all() -> AsyncIterator[DemoBus]:
     table = f'[bus]\nmode = "client"\nconnect = ["{endpoint}"]\nmulticast = false\n'
     try:
         commands = (f"zbridge ls --sessions --connect {endpoint}",)
-        yield DemoBus(endpoint, bus, Fleet(bus, REALM), lambda robot: table, commands)
+        yield DemoBus(endpoint, bus, Fleet(bus, REALM), lambda robot: table, commands, ("--connect", endpoint))
     finally:
         await bus.close()
 

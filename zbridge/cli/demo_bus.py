@@ -91,7 +91,8 @@ class DemoBus(msgspec.Struct, frozen=True):
     """How the parts of a demo use its bus.
 
     viewer: the session of the table. operator: the robots as the program that drives them sees them. table: the
-    ``[bus]`` table of a robot's gateway. commands: what to try in another terminal.
+    ``[bus]`` table of a robot's gateway. commands: what to try in another terminal. joins: the options by which the
+    console joins it.
     """
 
     endpoint: str
@@ -99,6 +100,7 @@ class DemoBus(msgspec.Struct, frozen=True):
     operator: Fleet
     table: Callable[[str], str]
     commands: tuple[str, ...]
+    joins: tuple[str, ...]
 
 
 @contextlib.asynccontextmanager
@@ -118,7 +120,7 @@ async def secure_bus(folder: Path, log: IO[bytes], robots: list[str]) -> AsyncIt
         )
         fleet = Fleet(operator, REALM, _OPERATOR)
         tables = {robot: (folder / gateway / "bus.toml").read_text("utf-8") for robot, gateway in gateways.items()}
-        yield DemoBus(endpoint, viewer, fleet, tables.__getitem__, commands)
+        yield DemoBus(endpoint, viewer, fleet, tables.__getitem__, commands, ("--tls", str(folder / _READER)))
 
 
 def make_members(folder: Path, endpoint: str, gateways: dict[str, str]) -> Path:

@@ -17,7 +17,7 @@ from zbridge.cli.options import chosen
 from zbridge.client import joined
 from zbridge.client.fleet import Fleet
 from zbridge.control.latch_store import state_folder
-from zbridge.errors import ConfigError
+from zbridge.errors import ConfigError, LinkError
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.toml import convert, read_toml
@@ -58,6 +58,10 @@ def run_console(bus: BusSettings, realm: str, listen: str, roster: Path | None) 
         from zbridge.views.console import server
     except ImportError as error:
         raise ConfigError(f"{error}: install the extra: pip install 'zbridge[console]'") from error
+    try:
+        at = Address.parse(f"tcp://{listen}")
+    except LinkError as error:
+        raise ConfigError(f"--listen {listen!r}: expected host:port") from error
     known = Roster(roster or state_folder() / f"{realm}.roster")
     known.load()
     gc.freeze()  # objects made at start-up live as long as the process; the collector skips them
@@ -66,7 +70,7 @@ def run_console(bus: BusSettings, realm: str, listen: str, roster: Path | None) 
         print(f"console at {address}", flush=True)  # noqa: T201
 
     async def work() -> None:
-        with contextlib.closing(server.listener(Address.parse(f"tcp://{listen}"))) as listening:
+        with contextlib.closing(server.listener(at)) as listening:
             async with joined(bus, realm) as session:
                 await server.serve(Fleet(session, realm, own_name(bus.tls)), session, listening, known, ready)
 

@@ -17,7 +17,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from tests.client import World
 from tests.ports import HOST
-from zbridge.errors import LinkError
+from zbridge.errors import ConfigError, LinkError
 from zbridge.protocol.address import Address
 from zbridge.views.console import page, server
 from zbridge.views.console.roster import Roster
@@ -174,7 +174,7 @@ async def test_there_are_no_more_pages_than_fit(scene: Scene, monkeypatch: pytes
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.168.0.2", "::", "example.org"])
 def test_it_listens_on_loopback_only(host: str) -> None:
-    with pytest.raises(LinkError, match="loopback only"):
+    with pytest.raises(ConfigError, match="loopback only"):
         server.listener(Address(host, 0))
 
 

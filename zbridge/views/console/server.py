@@ -24,7 +24,7 @@ from zbridge.bus import Bus
 from zbridge.client.fleet import Fleet
 from zbridge.client.fleet_model import FleetModel
 from zbridge.client.stops import summarize
-from zbridge.errors import LinkError, ZbridgeError
+from zbridge.errors import ConfigError, LinkError, ZbridgeError
 from zbridge.protocol.address import Address
 from zbridge.tasks import Tasks, race
 from zbridge.views.console.feed import FleetFeed
@@ -201,9 +201,9 @@ class _Server(uvicorn.Server):
 
 
 def listener(address: Address) -> socket.socket:
-    """Listen on loopback; raise LinkError for another address, or one that is taken."""
+    """Listen on loopback; raise ConfigError for another address, LinkError for one that is taken."""
     if address.host not in ("127.0.0.1", "localhost", "::1"):
-        raise LinkError(f"{address.host}: the console listens on loopback only: expected 127.0.0.1, localhost or ::1")
+        raise ConfigError(f"{address.host}: the console listens on loopback only: expected 127.0.0.1, localhost or ::1")
     family = socket.AF_INET6 if address.host == "::1" else socket.AF_INET
     try:
         return socket.create_server((address.host, address.port), family=family)

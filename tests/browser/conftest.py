@@ -61,7 +61,7 @@ class Feed:
 
     def __init__(self, *rows: dict[str, Any], **more: Any) -> None:
         self.asked: list[dict[str, Any]] = []
-        self._begin = {"full": True, "realm": "fleet", "bus": True, "notice": None, "roster": None, **more}
+        self._begin = {"full": True, "realm": "fleet", "bus": True, "notices": {}, "roster": None, **more}
         self._rows = rows
         self._socket: Any = None
 

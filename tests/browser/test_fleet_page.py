@@ -153,7 +153,7 @@ async def test_a_console_that_does_not_answer_is_said_and_a_stop_is_sent_when_it
 
 
 async def test_a_notice_is_read_out_and_hostile_text_stays_text(browser: Browser) -> None:
-    feed = Feed(row("r1"), notice={"text": EVIL, "at": 1_700_000_000, "good": False})
+    feed = Feed(row("r1"), notices={"all": {"text": EVIL, "at": 1_700_000_000, "good": False}})
     page = await browser.open(feed=feed)
     status = page.get_by_role("status")
     assert EVIL in await status.inner_text()

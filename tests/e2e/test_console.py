@@ -25,7 +25,7 @@ class Page:
     def __init__(self, opened: ClientConnection) -> None:
         self._opened = opened
         self.rows: dict[str, dict[str, Any]] = {}
-        self.notice: dict[str, Any] = {}
+        self.notices: dict[str, dict[str, Any]] = {}
 
     def until(self, condition: Callable[[], Any], what: str, timeout_s: float = 20.0) -> None:
         """Read until a condition is met."""
@@ -41,8 +41,14 @@ class Page:
         """Ask for something; give the sentence that comes of it."""
         before = time.time()
         self._opened.send(json.dumps({"do": do, "robot": robot}))
-        self.until(lambda: self.notice.get("good") is not None and self.notice["at"] > before, f"what came of {do}")
-        return str(self.notice["text"])
+        of = "one" if robot else "all"
+
+        def known() -> bool:
+            notice = self.notices.get(of, {})
+            return notice.get("good") is not None and notice["at"] > before
+
+        self.until(known, f"what came of {do}")
+        return str(self.notices[of]["text"])
 
     def states(self) -> dict[str, str]:
         return {name: row["state"] for name, row in self.rows.items()}
@@ -53,7 +59,7 @@ class Page:
         self.rows.update({row["name"]: row for row in message.get("rows", ())})
         for name in message.get("gone", ()):
             self.rows.pop(name, None)
-        self.notice = message.get("notice") or self.notice
+        self.notices = message.get("notices", self.notices)
 
 
 class Scene:

@@ -134,18 +134,20 @@ async def run_demo(seconds: float, *, secure: bool = False, console: bool = Fals
             *(f"  {name}: {_how_to_connect(find_protocol(robots[name]), listeners[name])}" for name in watch.rows),
         ]
         if _has_console():
-            at = await stack.enter_async_context(_console(folder, log, bus.joins))
+            at = await stack.enter_async_context(_console(folder, log, bus.joins, opens=console))
             how.append(f"the fleet in a browser, with STOP ALL: {at}")
-            if console:
-                webbrowser.open(at)
         await until_signal(_show(bus.operator, watch, seconds, how))
         await end([gateway for _, gateway in processes])  # all at once: each needs about a second to stop its robot
         await end([simulator for simulator, _ in processes])
         failed += [f"no data from {robot}" for robot, row in watch.rows.items() if not row.received]
         if seconds and failed:
-            for line in (folder / "log").read_text(errors="replace")[-2000:].splitlines():
-                print(shown(line), file=sys.stderr)  # noqa: T201
+            _print_end(folder / "log")
             raise ZbridgeError(f"{'; '.join(failed)}; the end of the processes' log is above")
+
+
+def _print_end(log: Path) -> None:
+    for line in log.read_text(errors="replace")[-2000:].splitlines():
+        print(shown(line), file=sys.stderr)  # noqa: T201
 
 
 def _has_console() -> bool:
@@ -153,8 +155,11 @@ def _has_console() -> bool:
 
 
 @contextlib.asynccontextmanager
-async def _console(folder: Path, log: IO[bytes], joins: tuple[str, ...]) -> AsyncIterator[str]:
-    """Run the console while the context lasts; yield its address, or why it has none. joins: how it joins the bus."""
+async def _console(folder: Path, log: IO[bytes], joins: tuple[str, ...], *, opens: bool) -> AsyncIterator[str]:
+    """Run the console while the context lasts; yield its address, or why it has none.
+
+    joins: the options by which it joins the bus. opens: whether to open it in a browser.
+    """
     options = ("--listen", "127.0.0.1:0", "--roster", str(folder / "roster"))
     async with process(log, "console", *options, *joins, read=True) as console:
         assert console.stdout is not None
@@ -162,7 +167,10 @@ async def _console(folder: Path, log: IO[bytes], joins: tuple[str, ...]) -> Asyn
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(START_S):
                 line = await console.stdout.readline()
-        yield line.decode().rpartition(" ")[2].strip() or "it did not start"
+        at = line.decode().rpartition(" ")[2].strip()
+        if opens and at:
+            webbrowser.open(at)
+        yield at or "it did not start"
 
 
 def _left_out(error: ZbridgeError) -> str:

@@ -15,7 +15,7 @@ import pytest
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from tests.client import World
+from tests.client import Gateway, World
 from tests.ports import HOST
 from zbridge.errors import ConfigError, LinkError
 from zbridge.protocol.address import Address
@@ -55,6 +55,19 @@ def states(message: dict[str, Any]) -> list[tuple[str, str]]:
     return [(row["name"], row["state"]) for row in message.get("rows", ())]
 
 
+async def latched(robot: Gateway) -> None:
+    """Wait until a robot is latched: within a second, which is less than a stop of all takes to be judged."""
+    async with asyncio.timeout(1):
+        while robot.control.state != "latched":  # noqa: ASYNC110
+            await asyncio.sleep(0.01)
+
+
+def notice(message: dict[str, Any], of: str) -> dict[str, Any]:
+    """What a message says of a stop of ``all``, or of ``one`` robot; nothing if it does not."""
+    found: dict[str, Any] = message.get("notices", {}).get(of) or {}
+    return found
+
+
 @pytest.fixture
 async def scene(tmp_path: Path) -> AsyncIterator[Scene]:
     world, roster = World("r1", "r2"), Roster(tmp_path / "fleet.roster")
@@ -84,22 +97,59 @@ async def test_a_page_gets_all_robots_and_what_has_come_of_a_stop(scene: Scene) 
         first = await until(opened, lambda message: len(message.get("rows", ())) == 2)
         assert sorted(row["name"] for row in first["rows"]) == ["r1", "r2"]
         await opened.send(json.dumps({"do": "stop_all"}))
-        assert (await until(opened, lambda message: message.get("notice")))["notice"]["good"] is None
-        done = await until(other, lambda message: (message.get("notice") or {}).get("good") is not None)
-        assert done["notice"]["text"] == f"2 of 2 {CONFIRMED}"
+        assert (await until(opened, lambda message: notice(message, "all")))["notices"]["all"]["good"] is None
+        done = await until(other, lambda message: notice(message, "all").get("good") is not None)
+        assert done["notices"]["all"]["text"] == f"2 of 2 {CONFIRMED}"
         assert {gateway.control.state for gateway in scene.world.gateways.values()} == {"latched"}
         await until(opened, lambda message: all(row["latched"] for row in message.get("rows", [{"latched": 0}])))
         late = scene.page()
         async with late as opened_late:
             snapshot = await until(opened_late, lambda message: message.get("full"))
-            assert snapshot["notice"]["text"] == f"2 of 2 {CONFIRMED}"
+            assert snapshot["notices"]["all"]["text"] == f"2 of 2 {CONFIRMED}"
+
+
+async def test_a_robot_that_was_released_and_driven_is_stopped_by_the_next_press_at_once(scene: Scene) -> None:
+    """The stop before is confirmed, and movement is still watched for."""
+    robot = scene.world.gateways["r1"]
+    async with scene.page() as opened:
+        await opened.send(json.dumps({"do": "stop_all"}))
+        await latched(robot)
+        await asyncio.sleep(server.SAME_PRESS_S)
+        await scene.world.fleet.unlatch()
+        async with scene.world.others.control("ann") as drive:
+            await drive(forward=0.5)
+            stops = robot.machine.stops
+            await opened.send(json.dumps({"do": "stop_all"}))
+            await latched(robot)
+        assert robot.machine.stops > stops
+        done = await until(opened, lambda message: notice(message, "all").get("good") is not None)
+        assert done["notices"]["all"]["text"] == f"2 of 2 {CONFIRMED}"
+
+
+async def test_what_is_said_of_one_robot_hides_nothing_that_was_said_of_all(scene: Scene) -> None:
+    async with scene.page() as opened:
+        await opened.send(json.dumps({"do": "stop_all"}))
+        await until(opened, lambda message: notice(message, "all").get("good"))
+        await opened.send(json.dumps({"do": "stop", "robot": "r9"}))
+        done = await until(opened, lambda message: notice(message, "one").get("good") is False)
+        assert done["notices"]["all"]["text"] == f"2 of 2 {CONFIRMED}"
+
+
+async def test_a_release_names_who_is_latched_by_a_stop_of_its_own(scene: Scene) -> None:
+    await scene.world.fleet["r2"].latch("wet floor")
+    async with scene.page() as opened:
+        await opened.send(json.dumps({"do": "release"}))
+        done = await until(opened, lambda message: notice(message, "all").get("good") is not None)
+    said = done["notices"]["all"]
+    assert not said["good"]
+    assert said["text"].endswith("still latched by a stop of its own, which zbridge unlatch ends: r2")
 
 
 async def test_one_robot_is_stopped_and_the_other_one_is_not(scene: Scene) -> None:
     async with scene.page() as opened:
         await opened.send(json.dumps({"do": "stop", "robot": "r2"}))
-        done = await until(opened, lambda message: (message.get("notice") or {}).get("good") is not None)
-    assert done["notice"]["text"] == "r2 stopped (its gateway sent it)"
+        done = await until(opened, lambda message: notice(message, "one").get("good") is not None)
+    assert done["notices"]["one"]["text"] == "r2 stopped (its gateway sent it)"
     assert scene.world.gateways["r2"].machine.stops
     assert not scene.world.gateways["r1"].machine.stops
 
@@ -154,7 +204,7 @@ async def test_a_page_that_sends_what_it_must_not_is_closed_and_others_stay(scen
         with pytest.raises(ConnectionClosed):
             await until(bad, lambda message: False)
         await good.send(json.dumps({"do": "stop", "robot": "r1"}))
-        await until(good, lambda message: (message.get("notice") or {}).get("good"))
+        await until(good, lambda message: notice(message, "one").get("good"))
 
 
 async def test_there_are_no_more_pages_than_fit(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -48,12 +48,16 @@ async def stop_fleet(fleet: Fleet, bus: Bus, roster: Iterable[str], alive: Colle
     roster: robots that must be among those on the bus. alive: the robots that have a gateway, as it changes.
     """
     stopping = asyncio.create_task(fleet.latch(None, "STOP ALL in the console", also=roster))
-    with contextlib.closing(MovementWatch(bus, fleet.realm)) as watch:  # the stop goes first
-        outcomes = await stopping
-        await asyncio.sleep(ROLL_OUT_S)
-        watch.begin()
-        await asyncio.sleep(WATCH_S)
-        return judge(outcomes, watch.moving(), alive)
+    await asyncio.sleep(0)  # the stop goes first
+    try:
+        with contextlib.closing(MovementWatch(bus, fleet.realm)) as watch:
+            outcomes = await stopping
+            await asyncio.sleep(ROLL_OUT_S)
+            watch.begin()
+            await asyncio.sleep(WATCH_S)
+            return judge(outcomes, watch.moving(), alive)
+    finally:
+        stopping.cancel()
 
 
 def judge(outcomes: Mapping[str, Outcome], moving: Collection[str], alive: Collection[str]) -> StopReport:
@@ -66,10 +70,10 @@ def judge(outcomes: Mapping[str, Outcome], moving: Collection[str], alive: Colle
             failed.setdefault(_finding(name, error, alive), []).append(name)
     confirmed = sum(error is None for error in outcomes.values())
     parts = [f"{confirmed} of {len(outcomes)} stopped (their gateways sent it)"]
-    parts += [f"{_names(names)} {finding}" for finding, names in failed.items()]
+    parts += [f"{listed(names)} {finding}" for finding, names in failed.items()]
     if moving:
         how = "move by their" if len(moving) > 1 else "moves by its"
-        parts.append(f"{_names(sorted(moving))} still {how} own pose or speed")
+        parts.append(f"{listed(sorted(moving))} still {how} own pose or speed")
     return StopReport("; ".join(parts), good=not failed and not moving)
 
 
@@ -83,7 +87,8 @@ def _finding(name: str, error: Exception, alive: Collection[str]) -> str:
     return "refused it" if isinstance(error, Refused) else "not confirmed"
 
 
-def _names(names: Collection[str]) -> str:
+def listed(names: Collection[str]) -> str:
+    """Name some robots, and say how many more there are."""
     named = list(names)[:NAMED]
     return ", ".join(named) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
 

@@ -8,7 +8,7 @@ export class Store {
   constructor(changed) {
     this.rows = new Map();
     this.rates = new Map();
-    this.notice = null;
+    this.notices = {};
     this.realm = "";
     this.bus = true;
     this.connected = false;
@@ -44,7 +44,7 @@ export class Store {
       this.rows.delete(name);
       this.rates.delete(name);
     }
-    for (const name of ["realm", "bus", "notice", "roster"]) if (name in message) this[name] = message[name];
+    for (const name of ["realm", "bus", "notices", "roster"]) if (name in message) this[name] = message[name];
     this.changed();
   }
 
@@ -69,7 +69,7 @@ export class Store {
     if (this.send({ do: "stop_all" })) return;
     this.stopAt = Date.now();
     const text = "STOP ALL was NOT sent: the console does not answer. Use the stop on the robots.";
-    this.notice = { text, at: Date.now() / 1000, good: false };
+    this.notices = { all: { text, at: Date.now() / 1000, good: false } };
     this.changed();
   }
 }

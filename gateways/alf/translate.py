@@ -71,7 +71,7 @@ class AlfRobot(RobotSide):
     """One vehicle, with one link or two; the first link drives."""
 
     hands_over = True
-    takes = ("drive", "light")
+    accepts = ("drive", "light")
     driving: AlfHqRole | None = None
     kept: ClassVar[dict[str, Any]] = {
         "_scanner": messages.ScannerInit | None,

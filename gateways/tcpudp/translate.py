@@ -107,7 +107,7 @@ class TcpUdpRobot(RobotSide):
         return carry_out(self, command, now) or _NOTHING
 
     @property
-    def takes(self) -> tuple[str, ...]:
+    def accepts(self) -> tuple[str, ...]:
         session = self.driving
         if session is None:
             return ()

@@ -170,7 +170,7 @@ class Wc2EcRobot(RobotSide):
         return Outcome()
 
     @property
-    def takes(self) -> tuple[str, ...]:
+    def accepts(self) -> tuple[str, ...]:
         if self._dialect is messages.Wc2EcDialect.DRAFT:
             return ("sensor",)
         rotational = self._table.motors(ROTATIONAL)

@@ -179,7 +179,7 @@ class Status(FleetMessage, frozen=True):
     """Whether the robot can be used, and what was negotiated with it. host: the machine of its gateway.
 
     stalled: True while the robot's link acknowledges nothing: what it is sent waits.
-    commands: what the robot takes now: ``stop``, ``drive``, ``light``, ``motor``; whoever holds the robot or not.
+    commands: what the robot accepts now: ``stop``, ``drive``, ``light``, ``motor``; whoever holds the robot or not.
     """
 
     state: RobotState

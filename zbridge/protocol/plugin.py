@@ -74,8 +74,8 @@ class RobotSide(Kept, ABC):
         """Send a command to the robot; raise Refused with the reason if the robot cannot take it."""
 
     @property
-    def takes(self) -> tuple[str, ...]:
-        """The commands besides ``stop`` that the robot takes in its present session, as their keys name them.
+    def accepts(self) -> tuple[str, ...]:
+        """The commands besides ``stop`` that the robot accepts in its present session, as their keys name them.
 
         Those of motors, sensors and raw messages are ``motor``, ``sensor`` and ``raw``, without the name behind.
         """

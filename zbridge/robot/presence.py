@@ -120,7 +120,7 @@ class Presence:
                 links=tuple(connection.status() for connection in self._links),
                 host=self._host,
                 stalled=self._commands.blocked or UNSET,
-                commands=("stop", *context.robot.takes) if agreed is not None and agreed.busy is None else (),
+                commands=("stop", *context.robot.accepts) if agreed is not None and agreed.busy is None else (),
             ),
         )
 

@@ -50,13 +50,13 @@ MOVES = "still moves by its own pose or speed"
 def test_the_sentence_tells_each_robot_that_needs_somebody(
     outcomes: dict[str, Outcome], moving: set[str], alive: set[str], text: str
 ) -> None:
-    report = judge(outcomes, moving, alive)
+    report = judge(outcomes, moving, alive.__contains__)
     assert report == StopReport(text, good=text == f"2 of 2 {CONFIRMED}")
 
 
 def test_robots_in_the_same_trouble_are_named_together_and_not_without_end() -> None:
     outcomes: dict[str, Outcome] = {f"r{number:02}": BusError("silence") for number in range(NAMED + 3)}
-    text = judge(outcomes, (), outcomes).text
+    text = judge(outcomes, (), outcomes.__contains__).text
     assert text.startswith(f"0 of 23 {CONFIRMED}; r00, r01, ")
     assert text.endswith("r19 and 3 more not confirmed")
 
@@ -80,7 +80,7 @@ async def publishing(world: World, robot: str, *messages: FleetMessage) -> Async
 
 
 async def stopped(world: World, *roster: str) -> StopReport:
-    return await stop_fleet(world.fleet, world.bus.join("console"), roster, world.gateways)
+    return await stop_fleet(world.fleet, world.bus.join("console"), roster, world.gateways.__contains__)
 
 
 @pytest.mark.jumping

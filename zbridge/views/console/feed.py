@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import msgspec
@@ -21,7 +21,7 @@ _TEXT = 200
 class FleetFeed:
     """The rows of all robots, as pages have them. clock: seconds since the epoch."""
 
-    def __init__(self, model: FleetModel, clock: Any = time.time) -> None:
+    def __init__(self, model: FleetModel, clock: Callable[[], float] = time.time) -> None:
         self.rows: dict[str, Row] = {}
         self._model = model
         self._clock = clock

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 
 import msgspec
 
@@ -42,10 +42,10 @@ class StopReport(msgspec.Struct, frozen=True):
     good: bool
 
 
-async def stop_fleet(fleet: Fleet, bus: Bus, roster: Iterable[str], alive: Collection[str]) -> StopReport:
+async def stop_fleet(fleet: Fleet, bus: Bus, roster: Iterable[str], is_alive: Callable[[str], bool]) -> StopReport:
     """Latch the whole fleet; report what was confirmed, and who moves nevertheless.
 
-    roster: robots that must be among those on the bus. alive: the robots that have a gateway, as it changes.
+    roster: robots that must be among those on the bus. is_alive: whether a robot has a gateway now.
     """
     stopping = asyncio.create_task(fleet.latch(None, "STOP ALL in the console", also=roster))
     await asyncio.sleep(0)  # the stop goes first
@@ -55,19 +55,19 @@ async def stop_fleet(fleet: Fleet, bus: Bus, roster: Iterable[str], alive: Colle
             await asyncio.sleep(ROLL_OUT_S)
             watch.begin()
             await asyncio.sleep(WATCH_S)
-            return judge(outcomes, watch.moving(), alive)
+            return judge(outcomes, watch.moving(), is_alive)
     finally:
         stopping.cancel()
 
 
-def judge(outcomes: Mapping[str, Outcome], moving: Collection[str], alive: Collection[str]) -> StopReport:
+def judge(outcomes: Mapping[str, Outcome], moving: Collection[str], is_alive: Callable[[str], bool]) -> StopReport:
     """Say what came of a stop: ``38 of 40 stopped (their gateways sent it); r7 away; r9 not confirmed``."""
     if not outcomes:
         return StopReport("No robot is known: the stop was sent to all, and nobody confirmed it", good=False)
     failed: dict[str, list[str]] = {}
     for name, error in outcomes.items():
         if error is not None:
-            failed.setdefault(_finding(name, error, alive), []).append(name)
+            failed.setdefault(_finding(name, error, is_alive), []).append(name)
     confirmed = sum(error is None for error in outcomes.values())
     parts = [f"{confirmed} of {len(outcomes)} stopped (their gateways sent it)"]
     parts += [f"{listed(names)} {finding}" for finding, names in failed.items()]
@@ -77,10 +77,10 @@ def judge(outcomes: Mapping[str, Outcome], moving: Collection[str], alive: Colle
     return StopReport("; ".join(parts), good=not failed and not moving)
 
 
-def _finding(name: str, error: Exception, alive: Collection[str]) -> str:
+def _finding(name: str, error: Exception, is_alive: Callable[[str], bool]) -> str:
     if isinstance(error, StopWaits):
         return "not reached yet: its link is stalled"
-    if name not in alive:
+    if not is_alive(name):
         return "without a gateway, which nothing can stop from here"
     if isinstance(error, NotReady):
         return "away"

@@ -81,7 +81,7 @@ class Console:
         """Follow the fleet, and tell the pages."""
         with contextlib.closing(self._bus.watch_connected(self._follow_bus)):
             while True:
-                self._look()
+                self._refresh()
                 await asyncio.to_thread(self._roster.save)
                 await asyncio.sleep(REFRESH_S)
 
@@ -110,7 +110,7 @@ class Console:
         self._connected = connected
         self._tell(_encode({"bus": connected}))
 
-    def _look(self) -> None:
+    def _refresh(self) -> None:
         self._roster.add(name for name, entry in self._model.robots.items() if entry.alive)
         changes = self._feed.refresh(self._roster.names, connected=self._connected)
         if changes is not None:
@@ -142,7 +142,7 @@ class Console:
         elif request.do == "forget" and not self._is_alive(request.robot):
             self._roster.forget(request.robot)
             self._model.robots.pop(request.robot, None)
-            self._look()
+            self._refresh()
 
     def _begin_stop_all(self) -> None:
         """Send a stop at each press: robots may have been released, and driven, since the last one was confirmed."""
@@ -165,7 +165,7 @@ class Console:
 
     async def _stop_all(self) -> None:
         try:
-            report = await stop_fleet(self._fleet, self._bus, self._roster.names.copy(), _Alive(self._model))
+            report = await stop_fleet(self._fleet, self._bus, self._roster.names.copy(), self._is_alive)
         except ZbridgeError as error:
             report = StopReport(f"STOP ALL: {error}", good=False)
         self._notify("all", report.text, good=report.good)
@@ -177,7 +177,7 @@ class Console:
             self._notify("all", f"Release: {error}", good=False)
             return
         await asyncio.sleep(RELEASED_S)
-        self._look()
+        self._refresh()
         latched = [name for name, row in self._feed.rows.items() if row["latched"] and name in outcomes]
         text = summarize(outcomes, "released") if outcomes else "No gateway is on the bus"
         if latched:
@@ -196,23 +196,6 @@ class Console:
     def _is_alive(self, robot: str) -> bool:
         entry = self._model.robots.get(robot)
         return entry is not None and entry.alive
-
-
-class _Alive:
-    """The robots that have a gateway now."""
-
-    def __init__(self, model: FleetModel) -> None:
-        self._model = model
-
-    def __contains__(self, robot: object) -> bool:
-        entry = self._model.robots.get(str(robot))
-        return entry is not None and entry.alive
-
-    def __iter__(self) -> Iterator[str]:
-        return (name for name, entry in self._model.robots.items() if entry.alive)
-
-    def __len__(self) -> int:
-        return sum(1 for _ in self)
 
 
 class _Server(uvicorn.Server):

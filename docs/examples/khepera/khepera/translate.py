@@ -30,7 +30,7 @@ class KheperaRobot(protocol.RobotSide):
     """One Khepera on one link."""
 
     link_names = ("robot",)
-    takes = ("drive", "light")
+    accepts = ("drive", "light")
 
     def __init__(self, options: Options, links: int = 1, metrics: protocol.Metrics | None = None) -> None:
         self.options = options

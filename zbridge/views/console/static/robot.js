@@ -19,7 +19,7 @@ export function Robot({ store, name }) {
     ["Driver", row.driver || "nobody"],
     ["Latched", row.latched.join("; ")],
     ["Protocol", `${row.protocol} ${row.version}`.trim()],
-    ["Takes", row.commands.join(", ")],
+    ["Accepts", row.commands.join(", ")],
     ["Messages a second", row.rate === null ? "" : row.rate.toFixed(1)],
     ["Refused commands", row.refused],
     ["Lost messages", row.gaps],

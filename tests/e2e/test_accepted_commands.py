@@ -1,4 +1,4 @@
-"""What ``status`` says a robot takes is what its gateway carries out, and nothing else; of each protocol."""
+"""What ``status`` says a robot accepts is what its gateway carries out, and nothing else; of each protocol."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ right = ["right wheel"]
 wheel_radius_m = 0.02
 track_m = 0.05
 """
-TAKEN = {
+ACCEPTED = {
     "tcpudp": {"drive", "stop", "mode", "lidar", "text", "raw"},
     "alf": {"drive", "stop", "light"},
     "wc2ec": {"drive", "stop", "motor"},
 }
 
 
-@pytest.mark.parametrize("protocol", TAKEN)
+@pytest.mark.parametrize("protocol", ACCEPTED)
 def test_what_status_lists_is_carried_out_and_the_rest_is_refused(bench: Bench, protocol: str) -> None:
     bench.gateway(device(bench.simulator(protocol), protocol, WHEELS if protocol == "wc2ec" else ""))
-    until(lambda: set(bench.fleet.last("r1/status").get("commands", ())) >= TAKEN[protocol], what="what it takes")
+    until(lambda: set(bench.fleet.last("r1/status").get("commands", ())) >= ACCEPTED[protocol], what="what it accepts")
     listed = set(bench.fleet.last("r1/status")["commands"])
-    assert listed - {"scan"} == TAKEN[protocol]
+    assert listed - {"scan"} == ACCEPTED[protocol]
     bench.fleet.hold()
     for name, fields in COMMANDS.items():
         bench.fleet.put(f"r1/@cmd/{name.replace(' ', '%20')}", **fields)
@@ -51,9 +51,9 @@ def test_what_status_lists_is_carried_out_and_the_rest_is_refused(bench: Bench, 
     assert unsupported == ({name.partition("/")[0] for name in COMMANDS} | {"dance"}) - listed, refusals
 
 
-def test_a_robot_that_is_away_takes_nothing(bench: Bench) -> None:
+def test_a_robot_that_is_away_accepts_nothing(bench: Bench) -> None:
     port = bench.simulator("alf")
     bench.gateway(device(port, "alf"))
-    until(lambda: bench.fleet.last("r1/status").get("commands"), what="what it takes")
+    until(lambda: bench.fleet.last("r1/status").get("commands"), what="what it accepts")
     bench.simulators[port].kill()
-    until(lambda: not bench.fleet.last("r1/status")["commands"], what="nothing is taken")
+    until(lambda: not bench.fleet.last("r1/status")["commands"], what="nothing is accepted")

@@ -18,6 +18,7 @@ from tests.e2e.conftest import HOST, Bench, device, listener
 from tests.e2e.measured.hq_judge import LET_GO_S
 from tests.e2e.rigs.fragile import charges
 from tests.e2e.rigs.hq_scene import playing, ports, soon
+from tests.ports import free_port
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "khepera"
 PACKAGES = {"khepera": EXAMPLE / "khepera", "toy": Path(__file__).parent / "other_package" / "toyrobot.py"}
@@ -64,7 +65,7 @@ def test_of_a_robot_that_has_no_hq_side_the_demo_says_so_and_a_listener_is_a_cle
     why = "torn:PROTOCOL cannot be loaded: ModuleNotFoundError: No module named 'of_nothing' in <module> (torn.py:1)"
     for protocol, code in (("torn", 2), ("alf", 0)):
         file = tmp_path / f"{protocol}.toml"
-        file.write_text('[robot]\nname = "r1"\n' + device(1, protocol))
+        file.write_text('[robot]\nname = "r1"\n' + device(free_port(), protocol))
         (line,) = run("zbridge", "check", str(file), code=code).splitlines()
         assert (f"protocol = 'torn': {why}" in line) is bool(code)
     shown = run("zbridge", "demo", "--seconds", "8")

@@ -21,7 +21,8 @@ from zbridge.bus import Bus, BusSettings, Tls, open_bus
 from zbridge.bus.tls.files import folder_settings, own_name
 from zbridge.client.driver import Driver
 from zbridge.client.feed import Feed, StateFeed
-from zbridge.client.fleet import Fleet, Robot
+from zbridge.client.fleet import Fleet
+from zbridge.client.robot import Robot
 from zbridge.metrics import Metrics
 
 __all__ = ["LOCAL_ROUTER", "Driver", "Feed", "Fleet", "Robot", "StateFeed", "bus_settings", "connect", "joined"]

@@ -23,6 +23,7 @@ import zbridge.client
 from zbridge.bus import Tls
 from zbridge.client import driver, feed
 from zbridge.client import fleet as fleets
+from zbridge.client import robot as robots
 from zbridge.errors import BusError, LeaseLost
 from zbridge.fleet.messages import (
     Battery,
@@ -169,19 +170,19 @@ class StateFeed(Feed[F]):
 class ControlFeed(StateFeed[Control]):
     """The messages of ``control``; calling the feed acquires the right to drive."""
 
-    _source: fleets.ControlFeed
+    _source: robots.ControlFeed
 
     @contextlib.contextmanager
     def __call__(self, who: str | None = None, **request: Any) -> Iterator[Driver]:
-        """Hold the lease while the context lasts; see :meth:`zbridge.client.fleet.ControlFeed.__call__`."""
+        """Hold the lease while the context lasts; see :meth:`zbridge.client.robot.ControlFeed.__call__`."""
         with _entered(self._loop, self._source(who, **request)) as holder:
             yield Driver(self._loop, holder)
 
 
-class Robot(_Blocking[fleets.Robot]):
+class Robot(_Blocking[robots.Robot]):
     """One robot: a feed for each key it publishes, queries, commands that need no lease, and the lease."""
 
-    def __init__(self, loop: _Loop, robot: fleets.Robot) -> None:
+    def __init__(self, loop: _Loop, robot: robots.Robot) -> None:
         super().__init__(loop, robot)
         self.name = robot.name
         self.scan: Feed[Scan] = Feed(loop, robot.scan)
@@ -211,17 +212,17 @@ class Robot(_Blocking[fleets.Robot]):
         """Return the feed of the legacy messages that no fleet message can hold."""
         return Feed(self._loop, self._source.raw(protocol))
 
-    ask_pose = _waits(fleets.Robot.ask_pose)
-    ask_map = _waits(fleets.Robot.ask_map)
-    stop = _waits(fleets.Robot.stop)
-    latch = _waits(fleets.Robot.latch)
-    unlatch = _waits(fleets.Robot.unlatch)
-    set_light = _waits(fleets.Robot.set_light)
-    set_lidar = _waits(fleets.Robot.set_lidar)
-    set_camera = _waits(fleets.Robot.set_camera)
-    say = _waits(fleets.Robot.say)
-    feed_scan = _waits(fleets.Robot.feed_scan)
-    set_sensor = _waits(fleets.Robot.set_sensor)
+    ask_pose = _waits(robots.Robot.ask_pose)
+    ask_map = _waits(robots.Robot.ask_map)
+    stop = _waits(robots.Robot.stop)
+    latch = _waits(robots.Robot.latch)
+    unlatch = _waits(robots.Robot.unlatch)
+    set_light = _waits(robots.Robot.set_light)
+    set_lidar = _waits(robots.Robot.set_lidar)
+    set_camera = _waits(robots.Robot.set_camera)
+    say = _waits(robots.Robot.say)
+    feed_scan = _waits(robots.Robot.feed_scan)
+    set_sensor = _waits(robots.Robot.set_sensor)
 
 
 class Driver(_Blocking[driver.Driver]):

@@ -17,7 +17,7 @@ from tests.fake_bus import FakeBus
 from zbridge.bus import Answer, IncomingQuery, Sample
 from zbridge.client import Fleet, Robot
 from zbridge.client.stops import CONFIRM_S, REPEAT_S
-from zbridge.errors import BusError, NotReady, PayloadError, Refused
+from zbridge.errors import BusError, NotReady, PayloadError, Refused, Unsupported
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import (
@@ -126,6 +126,44 @@ async def test_commands_that_need_no_lease(path: str, message: FleetMessage, wor
     assert sample.attachment is None
     ((taken, command),) = world.machine.commands
     assert (taken, type(command)) == (path, type(message))
+
+
+SWITCHES = ("light", "lidar", "camera")
+
+
+@pytest.mark.parametrize(
+    ("status", "error", "text"),
+    [
+        (
+            Status("established", commands=("stop", "drive")),
+            Unsupported,
+            "does not accept light; it accepts stop, drive",
+        ),
+        (Status("offline", reason="connection refused"), NotReady, "the robot is offline: connection refused"),
+        (Status("connecting"), NotReady, "the robot is connecting$"),
+    ],
+)
+async def test_what_a_robot_does_not_accept_is_refused_before_it_is_sent(
+    status: Status, error: type[Refused], text: str
+) -> None:
+    world = World("r1")
+    world.gateway.publish(topics.STATUS, status)
+    with pytest.raises(error, match=text):
+        await world.robot.set_light(True)
+    assert world.taken("@cmd/light") == []
+
+
+async def test_a_switch_of_a_robot_without_a_gateway_is_not_reported_as_sent() -> None:
+    with pytest.raises(BusError, match="no gateway answers"):
+        await World("r1", served=False).robot.set_lidar(True)
+
+
+@pytest.mark.parametrize("name", SWITCHES)
+async def test_a_listed_command_is_sent(name: str) -> None:
+    world = World("r1")
+    world.gateway.publish(topics.STATUS, Status("established", commands=("stop", *SWITCHES)))
+    await getattr(world.robot, f"set_{name}")(True)
+    assert len(world.taken(f"@cmd/{name}")) == 1
 
 
 # The stop

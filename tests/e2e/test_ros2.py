@@ -174,8 +174,10 @@ def test_a_latched_robot_is_driven_by_no_publisher_before_it_is_unlatched(scene:
 
 
 def test_a_call_switches_and_a_malformed_one_has_an_error(scene: Scene) -> None:
-    response, _ = scene.ros.call("/r1/set_light", SET_BOOL, scene.ros.request(SET_BOOL, data=True))
+    response, _ = scene.ros.call("/r1/set_lidar", SET_BOOL, scene.ros.request(SET_BOOL, data=True))
     assert response.success, response.message
+    response, _ = scene.ros.call("/r1/set_light", SET_BOOL, scene.ros.request(SET_BOOL, data=True))
+    assert (response.success, response.message.partition(";")[0]) == (False, "r1 does not accept light")
     key, _ = scene.ros.names("/r1/set_light", SET_BOOL)
     for payload, attachment in ((b"\x00\x01\x00\x00\x01", None), (b"\xff" * 300, bytes(33)), (b"", b"\x10" * 33)):
         replies = scene.ros.session.get(key, payload=payload, attachment=attachment, timeout=10.0)

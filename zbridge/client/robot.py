@@ -14,7 +14,7 @@ from zbridge.client import stops
 from zbridge.client.driver import Driver, default_who
 from zbridge.client.feed import WAITING, WAITING_IMAGES, Feed, StateFeed, reader
 from zbridge.clocks import raw_ms
-from zbridge.errors import BusError, Malformed, Refused, refusal
+from zbridge.errors import BusError, Malformed, NotReady, Refused, Unsupported, refusal
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import (
@@ -211,29 +211,45 @@ class Robot:
         """
         return await stops.unlatch_robot(self._bus, self._keys, self._own)
 
+    # The next ones raise Unsupported if the robot does not accept the command, NotReady if it accepts none now, and
+    # BusError if it has no gateway, as far as ``status`` tells.
+
     async def set_light(self, on: bool) -> None:
         """Turn the light on or off."""
-        await self._put(topics.CMD_LIGHT, Switch(on))
+        await self._command(topics.CMD_LIGHT, Switch(on))
 
     async def set_lidar(self, on: bool) -> None:
         """Turn the lidar on or off."""
-        await self._put(topics.CMD_LIDAR, Switch(on))
+        await self._command(topics.CMD_LIDAR, Switch(on))
 
     async def set_camera(self, on: bool) -> None:
         """Turn the camera on or off."""
-        await self._put(topics.CMD_CAMERA, Switch(on))
+        await self._command(topics.CMD_CAMERA, Switch(on))
 
     async def say(self, text: str) -> None:
         """Send the robot a text."""
-        await self._put(topics.CMD_TEXT, Text(text))
-
-    async def feed_scan(self, scan: Scan) -> None:
-        """Send the robot simulated lidar data."""
-        await self._put(topics.CMD_SCAN, scan)
+        await self._command(topics.CMD_TEXT, Text(text))
 
     async def set_sensor(self, name: str, setting: SensorSetting) -> None:
         """Change the settings of a sensor."""
-        await self._put(topics.CMD_SENSOR(name), setting)
+        await self._command(topics.CMD_SENSOR(name), setting)
+
+    async def feed_scan(self, scan: Scan) -> None:
+        """Send the robot simulated lidar data. Scans are repeated, so ``status`` is not read for each."""
+        await self._put(topics.CMD_SCAN, scan)
+
+    async def _command(self, topic: Topic, message: FleetMessage) -> None:
+        """Send a command if the robot accepts it now: a gateway's refusal is shown on ``control``, to all."""
+        name = topic.path.split("/")[1]
+        status = await self.status.last()
+        if status is None:
+            raise BusError(f"{self.name}: {name} was not sent: no gateway answers for this robot")
+        if status.state != "established":
+            why = f": {status.reason}" if status.reason else ""
+            raise NotReady(f"{self.name}: {name} was not sent: the robot is {status.state}{why}")
+        if status.commands and name not in status.commands:  # a busy robot lists none; its gateway says why it refuses
+            raise Unsupported(f"{self.name} does not accept {name}; it accepts {', '.join(status.commands)}")
+        await self._put(topic, message)
 
     def _feed(self, topic: Topic) -> Feed[Any]:
         most_waiting = WAITING_IMAGES if topic.qos.newest else WAITING

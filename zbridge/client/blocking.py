@@ -131,6 +131,7 @@ class Fleet(_Blocking[fleets.Fleet]):
     stop = _waits(fleets.Fleet.stop)
     latch = _waits(fleets.Fleet.latch)
     unlatch = _waits(fleets.Fleet.unlatch)
+    send_stop = _waits(fleets.Fleet.send_stop)
 
 
 class Feed(_Blocking[feed.Feed[T]]):

@@ -18,7 +18,7 @@ from zbridge.clocks import raw_ms
 from zbridge.errors import PayloadError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Status
+from zbridge.fleet.messages import Status, Stop
 from zbridge.fleet.processes import SessionEntry, Sessions
 from zbridge.fleet.topics import KeySpace, is_name, split_key
 
@@ -142,15 +142,22 @@ class Fleet:
         names = filter(is_name, await settled(self._gateways, lambda seen: seen))
         return await stops.unlatch_fleet(self._bus, self.realm, names, self._own)
 
-    async def _stop(
-        self, names: Iterable[str] | None, reason: str | None, *, latch: bool, also: Iterable[str] = ()
+    async def send_stop(
+        self, stop: Stop, names: Iterable[str] | None = None, *, also: Iterable[str] = ()
     ) -> dict[str, Outcome]:
-        stop = stops.new_stop(self._own, reason, latch=latch, secret=self._secret)
+        """Send a prepared stop, for callers that need its id or its sender's name; return as :meth:`stop` does."""
         if names is None:
             await stops.put_stop(self._bus, KeySpace(self.realm, "*"), stop)
             names = {*filter(is_name, await settled(self._gateways, lambda seen: seen)), *also}
         names = [names] if isinstance(names, str) else names
         return await stops.stop_robots(self._bus, self.realm, names, stop)
+
+    async def _stop(
+        self, names: Iterable[str] | None, reason: str | None, *, latch: bool, also: Iterable[str] = ()
+    ) -> dict[str, Outcome]:
+        return await self.send_stop(
+            stops.new_stop(self._own, reason, latch=latch, secret=self._secret), names, also=also
+        )
 
     @property
     def _own(self) -> str:

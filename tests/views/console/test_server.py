@@ -19,7 +19,7 @@ from tests.client import Gateway, World
 from tests.ports import HOST
 from zbridge.errors import ConfigError, LinkError
 from zbridge.protocol.address import Address
-from zbridge.views.console import page, server
+from zbridge.views.console import console, page, server
 from zbridge.views.console.roster import Roster
 
 CONFIRMED = "stopped (their gateways sent it)"
@@ -114,7 +114,7 @@ async def test_a_robot_that_was_released_and_driven_is_stopped_by_the_next_press
     async with scene.page() as opened:
         await opened.send(json.dumps({"do": "stop_all"}))
         await latched(robot)
-        await asyncio.sleep(server.SAME_PRESS_S)
+        await asyncio.sleep(console.SAME_PRESS_S)
         await scene.world.fleet.unlatch()
         async with scene.world.others.control("ann") as drive:
             await drive(forward=0.5)
@@ -208,7 +208,7 @@ async def test_a_page_that_sends_what_it_must_not_is_closed_and_others_stay(scen
 
 
 async def test_there_are_no_more_pages_than_fit(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server, "PAGES", 1)
+    monkeypatch.setattr(console, "PAGES", 1)
     async with scene.page() as first:
         await until(first, lambda message: message.get("full"))
         with pytest.raises(InvalidStatus):

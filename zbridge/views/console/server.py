@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import math
 import socket
-import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 
-import msgspec
 import uvicorn
 from starlette.applications import Starlette
 from starlette.middleware.gzip import GZipMiddleware
@@ -18,184 +15,18 @@ from starlette.requests import Request as HttpRequest
 from starlette.responses import FileResponse
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
-from starlette.websockets import WebSocket
 
 from zbridge.bus import Bus
 from zbridge.client.fleet import Fleet
-from zbridge.client.fleet_model import FleetModel
-from zbridge.client.stops import summarize
-from zbridge.errors import ConfigError, LinkError, ZbridgeError
+from zbridge.errors import ConfigError, LinkError
 from zbridge.protocol.address import Address
-from zbridge.tasks import Tasks, race
-from zbridge.views.console.feed import FleetFeed
-from zbridge.views.console.fleet_stop import StopReport, listed, stop_fleet
+from zbridge.tasks import race
+from zbridge.views.console.console import Console
 from zbridge.views.console.guard import Guard
-from zbridge.views.console.page import MOST_BYTES, Page, Request
+from zbridge.views.console.page import MOST_BYTES
 from zbridge.views.console.roster import Roster
 
-REFRESH_S = 0.5
-"""Seconds between two looks at the fleet."""
-PAGES = 100
-"""Most pages at a time; further ones are told so."""
-STOPS = 32
-"""Most stops of single robots at a time."""
-SAME_PRESS_S = 0.3
-"""Seconds within which two presses of STOP ALL are one: nobody was released in between."""
-RELEASED_S = 1.0
-"""Seconds after a release until robots have shown whether they are still latched."""
-_FULL = 1013
 _STATIC = Path(__file__).parent / "static"
-_encode = msgspec.json.Encoder().encode
-
-
-class StopNotice(msgspec.Struct, frozen=True):
-    """What pages are told of a stop or a release. at: Unix seconds. good: None while it is on its way."""
-
-    text: str
-    at: float
-    good: bool | None = None
-
-
-class Console:
-    """What the pages see and do."""
-
-    def __init__(self, fleet: Fleet, bus: Bus, model: FleetModel, roster: Roster) -> None:
-        self.notices: dict[str, StopNotice] = {}
-        """The last one ``"all"`` of the fleet, and ``"one"`` of a single robot since."""
-        self._fleet = fleet
-        self._bus = bus
-        self._model = model
-        self._roster = roster
-        self._feed = FleetFeed(model)
-        self._pages: set[Page] = set()
-        self._stopping: asyncio.Task[None] | None = None
-        self._stopped_at = -math.inf
-        self._releasing: asyncio.Task[None] | None = None
-        self._work = Tasks()
-        self._connected = True
-
-    def __repr__(self) -> str:
-        return f"<Console {self._feed!r}, {len(self._pages)} pages>"
-
-    async def run(self) -> None:
-        """Follow the fleet, and tell the pages."""
-        with contextlib.closing(self._bus.watch_connected(self._follow_bus)):
-            while True:
-                self._refresh()
-                await asyncio.to_thread(self._roster.save)
-                await asyncio.sleep(REFRESH_S)
-
-    async def serve(self, socket: WebSocket) -> None:
-        """Serve one page."""
-        if len(self._pages) >= PAGES:
-            await socket.close(_FULL, f"{PAGES} pages are open, the most there may be")
-            return
-        await socket.accept()
-        page = Page(socket, self._snapshot, self._carry_out)
-        self._pages.add(page)
-        try:
-            await page.serve()
-        finally:
-            self._pages.discard(page)
-
-    async def close(self) -> None:
-        """Wait for the stops that are on their way."""
-        fleet = [task for task in (self._stopping, self._releasing) if task is not None]
-        await asyncio.gather(*fleet, *self._work.running, return_exceptions=True)
-
-    def _follow_bus(self, connected: bool) -> None:
-        """The bus was lost, or is back: robots then have some seconds to show that they are there too."""
-        if connected:
-            self._model.opened_at = self._model.clock()
-        self._connected = connected
-        self._tell(_encode({"bus": connected}))
-
-    def _refresh(self) -> None:
-        self._roster.add(name for name, entry in self._model.robots.items() if entry.alive)
-        changes = self._feed.refresh(self._roster.names, connected=self._connected)
-        if changes is not None:
-            self._tell(changes)
-
-    def _snapshot(self) -> bytes:
-        return self._feed.snapshot(
-            realm=self._fleet.realm, bus=self._connected, notices=self.notices, roster=self._roster.fault
-        )
-
-    def _tell(self, message: bytes) -> None:
-        for page in self._pages:
-            page.tell(message)
-
-    def _notify(self, of: str, text: str, *, good: bool | None = None) -> None:
-        """Tell all pages. of: ``"all"`` or ``"one"``: what is said of one robot hides nothing that is said of all."""
-        self.notices[of] = StopNotice(text, time.time(), good)
-        self._tell(_encode({"notices": self.notices}))
-
-    # What pages ask for
-
-    def _carry_out(self, request: Request) -> None:
-        if request.do == "stop_all":
-            self._begin_stop_all()
-        elif request.do == "release" and (self._releasing is None or self._releasing.done()):
-            self._releasing = asyncio.create_task(self._release())
-        elif request.do == "stop" and request.robot:
-            self._begin_stop(request.robot)
-        elif request.do == "forget" and not self._is_alive(request.robot):
-            self._roster.forget(request.robot)
-            self._model.robots.pop(request.robot, None)
-            self._refresh()
-
-    def _begin_stop_all(self) -> None:
-        """Send a stop at each press: robots may have been released, and driven, since the last one was confirmed."""
-        now = asyncio.get_running_loop().time()
-        if now - self._stopped_at < SAME_PRESS_S:
-            return
-        self._stopped_at = now
-        for task in (self._stopping, self._releasing):
-            if task is not None:
-                task.cancel()
-        self.notices.clear()
-        self._notify("all", "STOP ALL is sent; waiting for the gateways to confirm it")
-        self._stopping = asyncio.create_task(self._stop_all())
-
-    def _begin_stop(self, robot: str) -> None:
-        if len(self._work) < STOPS:
-            self._work.start(self._stop(robot))
-        else:
-            self._notify("one", f"{robot}: NOT stopped: {STOPS} stops are on their way; use STOP ALL", good=False)
-
-    async def _stop_all(self) -> None:
-        try:
-            report = await stop_fleet(self._fleet, self._bus, self._roster.names.copy(), self._is_alive)
-        except ZbridgeError as error:
-            report = StopReport(f"STOP ALL: {error}", good=False)
-        self._notify("all", report.text, good=report.good)
-
-    async def _release(self) -> None:
-        try:
-            outcomes = await self._fleet.unlatch()
-        except ZbridgeError as error:
-            self._notify("all", f"Release: {error}", good=False)
-            return
-        await asyncio.sleep(RELEASED_S)
-        self._refresh()
-        latched = [name for name, row in self._feed.rows.items() if row["latched"] and name in outcomes]
-        text = summarize(outcomes, "released") if outcomes else "No gateway is on the bus"
-        if latched:
-            text += f"; still latched by a stop of its own, which zbridge unlatch ends: {listed(latched)}"
-        self._notify("all", text, good=bool(outcomes) and not any(outcomes.values()) and not latched)
-
-    async def _stop(self, robot: str) -> None:
-        self._notify("one", f"{robot}: the stop is sent; waiting for its gateway to confirm it")
-        try:
-            await self._fleet[robot].stop("console")
-        except ZbridgeError as error:
-            self._notify("one", str(error), good=False)
-        else:
-            self._notify("one", f"{robot} stopped (its gateway sent it)", good=True)
-
-    def _is_alive(self, robot: str) -> bool:
-        entry = self._model.robots.get(robot)
-        return entry is not None and entry.alive
 
 
 class _Server(uvicorn.Server):

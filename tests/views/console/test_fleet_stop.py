@@ -9,7 +9,7 @@ from collections.abc import AsyncIterator
 import pytest
 
 from tests.client import World
-from zbridge.client.stops import Outcome, StopWaits
+from zbridge.client.stops import Outcome, StopWaits, new_stop
 from zbridge.errors import BusError, NotReady, Unsupported
 from zbridge.fleet import topics
 from zbridge.fleet.messages import FleetMessage, Motion, Pose, Status
@@ -80,7 +80,8 @@ async def publishing(world: World, robot: str, *messages: FleetMessage) -> Async
 
 
 async def stopped(world: World, *roster: str) -> StopReport:
-    return await stop_fleet(world.fleet, world.bus.join("console"), roster, world.gateways.__contains__)
+    stop = new_stop("ann", "STOP ALL", latch=True)
+    return await stop_fleet(world.fleet, world.bus.join("console"), stop, roster, world.gateways.__contains__)
 
 
 @pytest.mark.jumping

@@ -31,7 +31,7 @@ class SlowSocket:
 @contextlib.asynccontextmanager
 async def served() -> AsyncIterator[tuple[SlowSocket, Page]]:
     socket: Any = SlowSocket()
-    page = Page(socket, lambda: b"all", lambda request: None)
+    page = Page(socket, lambda: b"all", lambda page, request: None)
     serving = asyncio.create_task(page.serve())
     try:
         await asyncio.sleep(0)

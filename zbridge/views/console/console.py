@@ -6,19 +6,25 @@ import asyncio
 import contextlib
 import math
 import time
+from collections.abc import Coroutine
+from typing import Any
 
 import msgspec
 from starlette.websockets import WebSocket
 
 from zbridge.bus import Bus
+from zbridge.client.driver import default_who
 from zbridge.client.fleet import Fleet
 from zbridge.client.fleet_model import FleetModel
-from zbridge.client.stops import summarize
+from zbridge.client.stops import new_stop, summarize
 from zbridge.errors import ZbridgeError
+from zbridge.fleet.messages import Stop
 from zbridge.tasks import Tasks
 from zbridge.views.console.feed import FleetFeed
 from zbridge.views.console.fleet_stop import StopReport, listed, stop_fleet
+from zbridge.views.console.history import ControlHistory
 from zbridge.views.console.page import Page, Request
+from zbridge.views.console.robot_watch import RobotWatches
 from zbridge.views.console.roster import Roster
 
 REFRESH_S = 0.5
@@ -26,7 +32,9 @@ REFRESH_S = 0.5
 PAGES = 100
 """Most pages at a time; further ones are told so."""
 STOPS = 32
-"""Most stops of single robots at a time."""
+"""Most stops of single robots, and switches, at a time."""
+ALIVE_S = 2.0
+"""Pages hear something at least so often, seconds: one that hears nothing does not take what it shows for present."""
 SAME_PRESS_S = 0.3
 """Seconds within which two presses of STOP ALL are one: nobody was released in between."""
 RELEASED_S = 1.0
@@ -60,15 +68,21 @@ class Console:
         self._releasing: asyncio.Task[None] | None = None
         self._work = Tasks()
         self._connected = True
+        self._told_at = -math.inf
+        self._history = ControlHistory(bus, fleet.realm, self._history_changed)
+        self._watches = RobotWatches(bus, fleet.realm, self._history.payload)
 
     def __repr__(self) -> str:
         return f"<Console {self._feed!r}, {len(self._pages)} pages>"
 
     async def run(self) -> None:
         """Follow the fleet, and tell the pages."""
-        with contextlib.closing(self._bus.watch_connected(self._follow_bus)):
+        self._history.open()
+        with contextlib.closing(self._bus.watch_connected(self._follow_bus)), contextlib.closing(self._history):
             while True:
                 self._refresh()
+                if asyncio.get_running_loop().time() - self._told_at >= ALIVE_S:
+                    self._tell(b"{}")
                 await asyncio.to_thread(self._roster.save)
                 await asyncio.sleep(REFRESH_S)
 
@@ -84,6 +98,7 @@ class Console:
             await page.serve()
         finally:
             self._pages.discard(page)
+            self._look(page, "")
 
     async def close(self) -> None:
         """Wait for the stops that are on their way."""
@@ -108,7 +123,11 @@ class Console:
             realm=self._fleet.realm, bus=self._connected, notices=self.notices, roster=self._roster.fault
         )
 
+    def _history_changed(self, robot: str) -> None:
+        self._watches.history_changed(robot)
+
     def _tell(self, message: bytes) -> None:
+        self._told_at = asyncio.get_running_loop().time()
         for page in self._pages:
             page.tell(message)
 
@@ -119,17 +138,43 @@ class Console:
 
     # What pages ask for
 
-    def _carry_out(self, request: Request) -> None:
+    def _carry_out(self, page: Page, request: Request) -> None:
+        robot = request.robot
         if request.do == "stop_all":
             self._begin_stop_all()
         elif request.do == "release" and (self._releasing is None or self._releasing.done()):
             self._releasing = asyncio.create_task(self._release())
-        elif request.do == "stop" and request.robot:
-            self._begin_stop(request.robot)
-        elif request.do == "forget" and not self._is_alive(request.robot):
-            self._roster.forget(request.robot)
-            self._model.robots.pop(request.robot, None)
+        elif request.do == "look":
+            self._look(page, robot)
+        elif request.do == "stop" and robot:
+            self._begin(self._stop(robot), f"{robot}: NOT stopped: {STOPS} stops are on their way; use STOP ALL")
+        elif request.do == "switch" and robot and request.name:
+            switching = self._switch(robot, request.name, on=request.on)
+            self._begin(switching, f"{robot}: {request.name} was not sent: {STOPS} commands are on their way")
+        elif request.do == "forget" and not self._is_alive(robot):
+            self._roster.forget(robot)
+            self._model.robots.pop(robot, None)
             self._refresh()
+
+    def _look(self, page: Page, robot: str) -> None:
+        """Show a page another robot, or none."""
+        before = page.look(self._watches.join(robot) if robot else None)
+        if before is not None:
+            self._watches.leave(before.robot)
+
+    def _begin(self, work: Coroutine[Any, Any, None], otherwise: str) -> None:
+        """Work beside; tell ``otherwise`` if too much is under way."""
+        if len(self._work) < STOPS:
+            self._work.start(work)
+        else:
+            work.close()
+            self._notify("one", otherwise, good=False)
+
+    def _new_stop(self, reason: str, *, latch: bool) -> Stop:
+        stop = new_stop(self._fleet.name or default_who(), reason, latch=latch)
+        assert isinstance(stop.id, bytes)
+        self._history.note_own(stop.id, "this console")
+        return stop
 
     def _begin_stop_all(self) -> None:
         """Send a stop at each press: robots may have been released, and driven, since the last one was confirmed."""
@@ -144,15 +189,10 @@ class Console:
         self._notify("all", "STOP ALL is sent; waiting for the gateways to confirm it")
         self._stopping = asyncio.create_task(self._stop_all())
 
-    def _begin_stop(self, robot: str) -> None:
-        if len(self._work) < STOPS:
-            self._work.start(self._stop(robot))
-        else:
-            self._notify("one", f"{robot}: NOT stopped: {STOPS} stops are on their way; use STOP ALL", good=False)
-
     async def _stop_all(self) -> None:
         try:
-            report = await stop_fleet(self._fleet, self._bus, self._roster.names.copy(), self._is_alive)
+            stop = self._new_stop("STOP ALL in the console", latch=True)
+            report = await stop_fleet(self._fleet, self._bus, stop, self._roster.names.copy(), self._is_alive)
         except ZbridgeError as error:
             report = StopReport(f"STOP ALL: {error}", good=False)
         self._notify("all", report.text, good=report.good)
@@ -173,12 +213,21 @@ class Console:
 
     async def _stop(self, robot: str) -> None:
         self._notify("one", f"{robot}: the stop is sent; waiting for its gateway to confirm it")
-        try:
-            await self._fleet[robot].stop("console")
-        except ZbridgeError as error:
+        outcomes = await self._fleet.send_stop(self._new_stop("console", latch=False), [robot])
+        if (error := outcomes[robot]) is not None:
             self._notify("one", str(error), good=False)
         else:
             self._notify("one", f"{robot} stopped (its gateway sent it)", good=True)
+
+    async def _switch(self, robot: str, name: str, *, on: bool) -> None:
+        target = self._fleet[robot]
+        switches = {"light": target.set_light, "lidar": target.set_lidar, "camera": target.set_camera}
+        try:
+            await switches[name](on)
+        except ZbridgeError as error:
+            self._notify("one", str(error), good=False)
+        else:
+            self._notify("one", f"{robot}: {name} {'on' if on else 'off'} was sent", good=True)
 
     def _is_alive(self, robot: str) -> bool:
         entry = self._model.robots.get(robot)

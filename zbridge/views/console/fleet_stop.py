@@ -19,7 +19,7 @@ from zbridge.client.stops import Outcome, StopWaits
 from zbridge.errors import NotReady, PayloadError, Refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Motion, Pose
+from zbridge.fleet.messages import Motion, Pose, Stop
 from zbridge.fleet.topics import is_name, split_key
 
 ROLL_OUT_S = 0.5
@@ -42,12 +42,14 @@ class StopReport(msgspec.Struct, frozen=True):
     good: bool
 
 
-async def stop_fleet(fleet: Fleet, bus: Bus, roster: Iterable[str], is_alive: Callable[[str], bool]) -> StopReport:
-    """Latch the whole fleet; report what was confirmed, and who moves nevertheless.
+async def stop_fleet(
+    fleet: Fleet, bus: Bus, stop: Stop, roster: Iterable[str], is_alive: Callable[[str], bool]
+) -> StopReport:
+    """Send a latching stop to the whole fleet; report what was confirmed, and who moves nevertheless.
 
     roster: robots that must be among those on the bus. is_alive: whether a robot has a gateway now.
     """
-    stopping = asyncio.create_task(fleet.latch(None, "STOP ALL in the console", also=roster))
+    stopping = asyncio.create_task(fleet.send_stop(stop, also=roster))
     await asyncio.sleep(0)  # the stop goes first
     try:
         with contextlib.closing(MovementWatch(bus, fleet.realm)) as watch:

@@ -26,7 +26,7 @@ export function Header({ store }) {
       </button>
     </div>
     <div class="notices" role="status" aria-live="assertive">
-      ${!store.connected && html`<p class="notice bad">The console does not answer: what is shown is old.</p>`}
+      ${(!store.connected || store.silent) && html`<p class="notice bad">The console does not answer: what is shown is old.</p>`}
       ${store.connected && !store.bus && html`<p class="notice bad">The bus is lost: nothing is known of the robots.</p>`}
       ${store.roster && html`<p class="notice bad">The list of known robots is not saved: ${store.roster}</p>`}
       ${["all", "one"].map((of) => store.notices[of] && html`<${Notice} key=${of} notice=${store.notices[of]} />`)}

@@ -1,41 +1,147 @@
-// The page of one robot: what is known of it, and its stop.
+// The page of one robot: its picture, its plots, what is known of it, and its stop.
 
-import { html } from "./vendor/htm-preact.js";
+import { html, useEffect, useRef, useState } from "./vendor/htm-preact.js";
 import { leave } from "./header.js";
 import { since, tone } from "./fleet.js";
+import { unpack } from "./msgpack.js";
+import { Plots, readValues } from "./plots.js";
+import { Facts, History, Published, Refusals, Sensors, Sessions, Switches, Texts } from "./panels.js";
+import { RobotData } from "./robot_data.js";
+import { Scene } from "./scene.js";
+
+const TICK_MS = 250;
+const WAIT_S = 3; // until what has not come is taken for not published
+const PRESENT = ["established", "LATCHED", "stalled"];
 
 export function Robot({ store, name }) {
   const row = store.rows.get(name);
+  const [, turn] = useState(0);
+  const data = useRobot(store, name, () => turn((count) => count + 1));
   if (!row) {
     return html`<section class="robot">
       <h1>${name}</h1>
-      <p>Nobody knows this robot. <a href="#">All robots</a></p>
+      <p>${store.known ? "The console does not know this robot." : "Loading."} <a href="#">All robots</a></p>
     </section>`;
   }
-  const facts = [
-    ["State", row.state],
-    ["Why", row.reason],
-    ["Last seen", row.seen === null ? "" : since(row.seen)],
-    ["Driver", row.driver || "nobody"],
-    ["Latched", row.latched.join("; ")],
-    ["Protocol", `${row.protocol} ${row.version}`.trim()],
-    ["Accepts", row.commands.join(", ")],
-    ["Messages a second", row.rate === null ? "" : row.rate.toFixed(1)],
-    ["Refused commands", row.refused],
-    ["Lost messages", row.gaps],
-    ["Host", row.host],
-    ["Gateway", row.gateway],
-  ].filter(([, value]) => value !== "" && value !== null);
+  data.away = !PRESENT.includes(row.state) || !store.connected || !store.bus;
+  return html`<section class="robot ${tone(row)}">
+    <${Title} row=${row} store=${store} />
+    <div class="columns">
+      <div class="views">
+        <${Picture} data=${data} />
+        <${Camera} data=${data} />
+        <${Plots} data=${data} />
+      </div>
+      <div class="panels">
+        <${Facts} row=${row} data=${data} />
+        <${Switches} row=${row} data=${data} store=${store} />
+        <${Published} data=${data} waited=${performance.now() / 1000 - data.began > WAIT_S} />
+        <${Refusals} data=${data} />
+        <${History} data=${data} />
+        <${Sensors} data=${data} />
+        <${Sessions} data=${data} unpack=${unpack} />
+        <${Texts} data=${data} />
+      </div>
+    </div>
+  </section>`;
+}
+
+// Looks at a robot while its page is in sight, and redraws the text of the page four times a second.
+function useRobot(store, name, redraw) {
+  const data = useRef(null);
+  if (data.current?.name !== name) data.current = store.data(name);
+  useEffect(() => {
+    const see = () => store.look(document.hidden ? "" : name);
+    const tick = setInterval(() => {
+      if (document.hidden) return;
+      data.current.sample(readValues(data.current));
+      redraw();
+    }, TICK_MS);
+    see();
+    document.addEventListener("visibilitychange", see);
+    return () => {
+      clearInterval(tick);
+      document.removeEventListener("visibilitychange", see);
+      store.look("");
+    };
+  }, [name]);
+  return data.current;
+}
+
+function Title({ row, store }) {
   const stop = (event) => {
     leave(event);
-    store.send({ do: "stop", robot: name });
+    store.send({ do: "stop", robot: row.name });
   };
-  return html`<section class="robot ${tone(row)}">
-    <p><a href="#">All robots</a></p>
-    <h1>${name}</h1>
-    <button type="button" class="stop" aria-label=${`Stop ${name}`} onClick=${stop}>Stop</button>
-    <dl>
-      ${facts.map(([title, value]) => html`<dt>${title}</dt><dd>${value}</dd>`)}
-    </dl>
+  const why = [row.seen !== null ? `last seen ${since(row.seen)}` : "", row.reason].filter(Boolean).join("; ");
+  return html`<div class="title">
+    <a href="#" aria-label="All robots">‹ All robots</a>
+    <h1>${row.name}</h1>
+    <span class="state"><b>${row.state}</b></span>
+    <span class="driver">${driverText(row)}</span>
+    <button type="button" class="stop" aria-label=${`Stop ${row.name}`} onClick=${stop}>Stop</button>
+    ${why && html`<p class="why">${why}</p>`}
+  </div>`;
+}
+
+function driverText(row) {
+  if (row.latched.length) return row.latched.join("; ");
+  if (!row.driver) return "nobody drives";
+  return row.driver === "stopped" ? "stopped" : `${row.driver} drives`;
+}
+
+function Picture({ data }) {
+  const canvas = useRef(null);
+  const scene = useRef(null);
+  const [, turn] = useState(0);
+  useEffect(() => {
+    const made = (scene.current = new Scene(canvas.current, data));
+    made.moved = () => turn((count) => count + 1);
+    data.changed = () => made.schedule();
+    return () => {
+      data.changed = () => {};
+      made.close();
+    };
+  }, [data]);
+  useEffect(() => scene.current.schedule()); // ages, too
+  const old = ["map", "scan", "pose"].filter((path) => data.entries.has(path) && (data.isOld(path) || data.away));
+  const ages = old.map((path) => `${path} ${Math.round(data.age(path))} s old`).join(", ");
+  const zoom = (factor) => (event) => {
+    leave(event);
+    scene.current.zoom(factor);
+  };
+  const follow = (event) => {
+    leave(event);
+    scene.current.follow();
+  };
+  return html`<section class="panel picture">
+    <canvas ref=${canvas} tabindex="0" role="img" aria-label=${`Map, scan and place of ${data.name}${ages ? `; ${ages}` : ""}`}></canvas>
+    ${ages && html`<p class="overlay age">${ages}</p>`}
+    <p class="overlay scale">${data.poses.length ? "" : "in the robot's own frame; "}grid: ${(scene.current?.scale ?? 40) >= 20 ? 1 : 10} m</p>
+    <div class="overlay tools">
+      <button type="button" aria-label="Zoom in" onClick=${zoom(1.25)}>+</button>
+      <button type="button" aria-label="Zoom out" onClick=${zoom(0.8)}>−</button>
+      ${scene.current?.follows === false && html`<button type="button" onClick=${follow}>Follow</button>`}
+    </div>
+  </section>`;
+}
+
+function Camera({ data }) {
+  const [shown, setShown] = useState({ message: null, address: null, broken: false });
+  const message = data.message("image");
+  useEffect(() => {
+    if (!message || message === shown.message) return;
+    if (shown.address) URL.revokeObjectURL(shown.address);
+    const type = message.format === "png" ? "image/png" : "image/jpeg";
+    setShown({ message, address: URL.createObjectURL(new Blob([message.data], { type })), broken: false });
+  });
+  useEffect(() => () => shown.address && URL.revokeObjectURL(shown.address), []);
+  if (!message) return null;
+  const old = data.isOld("image") || data.away;
+  const broken = () => setShown((now) => ({ ...now, broken: true }));
+  return html`<section class="panel camera ${old ? "old" : ""}">
+    ${shown.broken && html`<p class="empty">What the camera sent is no picture.</p>`}
+    ${!shown.broken && shown.address && html`<img src=${shown.address} alt=${`Camera of ${data.name}`} onError=${broken} />`}
+    ${old && html`<p class="overlay age">picture ${Math.round(data.age("image"))} s old</p>`}
   </section>`;
 }

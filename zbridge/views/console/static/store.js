@@ -1,8 +1,13 @@
-// What the page knows: the rows of all robots, the last notice, and whether anybody answers.
+// What the page knows: the rows of all robots, the last notices, the robot that it looks at, and whether anybody answers.
+
+import { RobotData } from "./robot_data.js";
 
 const AGAIN_MS = [250, 500, 1000, 2000];
 const KEPT = 60; // rates of a robot that its sparkline shows
 const STALE_STOP_MS = 10000;
+const SILENT_MS = 6000; // the console says something every 2 s
+const UNANSWERED_MS = 1500; // it says at once that it sends STOP ALL
+const ROBOTS = 8; // robots whose trail and plots are kept while another one is looked at
 
 export class Store {
   constructor(changed) {
@@ -15,9 +20,34 @@ export class Store {
     this.roster = null;
     this.changed = changed;
     this.tries = 0;
+    this.known = false; // whether the robots have been told
     this.stopAt = null; // when STOP ALL was asked for and nobody answered
+    this.unanswered = null; // runs while STOP ALL is not answered
+    this.heardAt = performance.now();
+    this.looked = "";
+    this.robots = new Map(); // by name, the one that was looked at last at the end
     this.connect();
     setInterval(() => this.sample(), 1000);
+  }
+
+  get silent() {
+    return this.connected && performance.now() - this.heardAt > SILENT_MS;
+  }
+
+  // What is known of a robot; the trails of the last few are kept.
+  data(name) {
+    const data = this.robots.get(name) ?? new RobotData(name);
+    this.robots.delete(name);
+    this.robots.set(name, data);
+    if (this.robots.size > ROBOTS) this.robots.delete(this.robots.keys().next().value);
+    return data;
+  }
+
+  // Asks for what a robot publishes; "": for none.
+  look(name) {
+    this.looked = name;
+    if (name) this.robots.get(name)?.reconnected();
+    this.send({ do: "look", robot: name });
   }
 
   connect() {
@@ -27,9 +57,15 @@ export class Store {
       this.connected = true;
       if (this.stopAt !== null && Date.now() - this.stopAt < STALE_STOP_MS) this.send({ do: "stop_all" });
       this.stopAt = null;
+      if (this.looked) this.look(this.looked);
       this.changed();
     };
-    socket.onmessage = (event) => this.take(JSON.parse(event.data));
+    socket.binaryType = "arraybuffer";
+    socket.onmessage = (event) => {
+      this.heardAt = performance.now();
+      if (typeof event.data === "string") this.take(JSON.parse(event.data));
+      else this.robots.get(this.looked)?.take(new Uint8Array(event.data));
+    };
     socket.onclose = () => {
       this.connected = false;
       this.changed();
@@ -39,6 +75,8 @@ export class Store {
 
   take(message) {
     if (message.full) this.rows.clear();
+    this.known = this.known || Boolean(message.full);
+    if (message.notices?.all) this.clearUnanswered();
     for (const row of message.rows ?? []) this.rows.set(row.name, row);
     for (const name of message.gone ?? []) {
       this.rows.delete(name);
@@ -55,6 +93,7 @@ export class Store {
       if (rates.length > KEPT) rates.shift();
       this.rates.set(name, rates);
     }
+    if (this.silent) this.changed();
   }
 
   send(request) {
@@ -66,9 +105,21 @@ export class Store {
   }
 
   stopAll() {
-    if (this.send({ do: "stop_all" })) return;
+    this.clearUnanswered();
+    if (this.send({ do: "stop_all" })) {
+      const text = "STOP ALL: the console has not answered yet. Use the stop on the robots.";
+      this.unanswered = setTimeout(() => this.warn(text), UNANSWERED_MS);
+      return;
+    }
     this.stopAt = Date.now();
-    const text = "STOP ALL was NOT sent: the console does not answer. Use the stop on the robots.";
+    this.warn("STOP ALL was NOT sent: the console does not answer. Use the stop on the robots.");
+  }
+
+  clearUnanswered() {
+    clearTimeout(this.unanswered);
+  }
+
+  warn(text) {
     this.notices = { all: { text, at: Date.now() / 1000, good: false } };
     this.changed();
   }

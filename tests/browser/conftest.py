@@ -1,15 +1,24 @@
-"""A Chromium, and pages whose feed is mocked. Without one the tests are skipped, and say where it was looked for."""
+"""A Chromium, and pages whose feed is mocked.
+
+Without a Chromium the tests are skipped and say where it was looked for; where ``ZBRIDGE_CHROMIUM`` names one that is
+not there, they fail. Of all workers two have a browser at a time: more would starve the tests that measure time.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import fcntl
 import json
 import os
 import shutil
-from collections.abc import AsyncIterator, Callable
+import tempfile
+import time
+from collections.abc import AsyncIterator, Callable, Iterator
+from pathlib import Path
 from typing import Any
 
+import msgpack
 import pytest
 
 from tests.fake_bus import FakeBus
@@ -19,9 +28,14 @@ from zbridge.protocol.address import Address
 from zbridge.views.console import server
 from zbridge.views.console.roster import Roster
 
-CHROMIUM = os.environ.get("ZBRIDGE_CHROMIUM") or shutil.which("chromium")
+NAMED = os.environ.get("ZBRIDGE_CHROMIUM")
+CHROMIUM = NAMED or shutil.which("chromium")
+PICTURES = os.environ.get("ZBRIDGE_PICTURES")
+"""A folder in which each page that a test photographs is kept."""
 ARGUMENTS = ("--no-sandbox", "--disable-quic", "--disable-background-networking", "--disable-component-update")
 WIDE, NARROW = {"width": 1200, "height": 700}, {"width": 360, "height": 740}
+AT_ONCE = 2
+_READS_BACK = "Canvas2D: Multiple readback operations"
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -33,7 +47,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     else:
         why = "" if CHROMIUM else "no Chromium (looked in PATH and ZBRIDGE_CHROMIUM)"
     ours = [item for item in items if item.path.parent.name == "browser"]
-    for item in ours if why else ():
+    for item in ours if why and not NAMED else ():
         item.add_marker(pytest.mark.skip(reason=f"{why}: {len(ours)} browser tests not run"))
 
 
@@ -44,16 +58,28 @@ class Browser:
         self._chromium, self.at = chromium, at
         self.complaints: list[str] = []
 
-    async def open(self, *, feed: Callable[[Any], None] | None = None, size: Any = WIDE, scheme: str = "light") -> Any:
+    async def open(
+        self, path: str = "", *, feed: Callable[[Any], None] | None = None, size: Any = WIDE, scheme: str = "light"
+    ) -> Any:
         """Open the console; ``feed`` is given the page's socket, of which nobody else hears."""
         context = await self._chromium.new_context(viewport=size, color_scheme=scheme, reduced_motion="reduce")
         page = await context.new_page()
-        page.on("console", lambda message: self.complaints.append(f"{message.type}: {message.text}"))
-        page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        page.on("console", lambda message: self._complain(f"{message.type}: {message.text}"))
+        page.on("pageerror", lambda error: self._complain(str(error)))
         if feed is not None:
             await page.route_web_socket("**/socket", feed)
-        await page.goto(self.at)
+        await page.goto(self.at + path)
         return page
+
+    async def photograph(self, page: Any, name: str) -> None:
+        """Keep a picture of the whole page for people to look at, if somebody asked for it."""
+        picture = await page.screenshot(full_page=True)
+        if PICTURES is not None:
+            (Path(PICTURES) / f"{name}.png").write_bytes(picture)
+
+    def _complain(self, text: str) -> None:
+        if _READS_BACK not in text:  # the tests themselves do that
+            self.complaints.append(text)
 
 
 class Feed:
@@ -73,24 +99,84 @@ class Feed:
     def tell(self, **message: Any) -> None:
         self._socket.send(json.dumps(message))
 
+    def publish(
+        self, robot: str, *, period_s: float = 1.0, age_s: float = 0.0, late_s: float = 0.0, **messages: Any
+    ) -> None:
+        """Send messages of a robot by their paths (``__`` for ``/``); bytes are sent as they are.
+
+        age_s: how long ago the console received them. late_s: how long this frame was on its way.
+        """
+        now = time.monotonic() - late_s
+        news = [
+            (path.replace("__", "/"), now - age_s, period_s, each if isinstance(each, bytes) else msgpack.packb(each))
+            for path, each in messages.items()
+        ]
+        self._socket.send(msgpack.packb({"robot": robot, "now": now, "news": news}))
+
+    def requests(self, *do: str) -> list[dict[str, Any]]:
+        """Give what was asked for, besides looking at robots; or only what these words ask for."""
+        return [each for each in self.asked if (each["do"] in do if do else each["do"] != "look")]
+
+    async def looked_at(self, robot: str) -> None:
+        """Wait until the page looks at a robot."""
+        await soon(lambda: {"do": "look", "robot": robot} in self.asked)
+
     async def close(self) -> None:
         await self._socket.close()
+
+
+async def soon(condition: Callable[[], Any], within_s: float = 10.0) -> None:
+    async with asyncio.timeout(within_s):
+        while not condition():  # noqa: ASYNC110
+            await asyncio.sleep(0.02)
+
+
+@contextlib.asynccontextmanager
+async def launched(*more: str, **options: Any) -> AsyncIterator[Any]:
+    """Run a Chromium, when fewer than :data:`AT_ONCE` run."""
+    from playwright.async_api import async_playwright
+
+    with await asyncio.to_thread(_turn):
+        async with async_playwright() as playwright:
+            arguments = [*ARGUMENTS, *more]
+            chromium = await playwright.chromium.launch(executable_path=CHROMIUM, args=arguments, **options)
+            try:
+                yield chromium
+            finally:
+                await chromium.close()
+
+
+def _turn() -> contextlib.AbstractContextManager[None]:
+    """Wait for a place among all workers."""
+    places = [Path(tempfile.gettempdir()) / f"zbridge-browser-{os.getuid()}-{place}" for place in range(AT_ONCE)]
+    files = [place.open("w") for place in places]
+    while True:
+        for file in files:
+            with contextlib.suppress(BlockingIOError):
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return _closing(files)
+        time.sleep(0.05)
+
+
+@contextlib.contextmanager
+def _closing(files: list[Any]) -> Iterator[None]:
+    try:
+        yield
+    finally:
+        for file in files:
+            file.close()
 
 
 @pytest.fixture
 async def browser(tmp_path: Any) -> AsyncIterator[Browser]:
     """A Chromium before a console without robots."""
-    from playwright.async_api import async_playwright
-
     served: asyncio.Future[str] = asyncio.get_running_loop().create_future()
     bus = FakeBus().join("console")
     with contextlib.closing(server.listener(Address(HOST, 0))) as listening:
         roster = Roster(tmp_path / "roster")
         serving = asyncio.create_task(server.serve(Fleet(bus), bus, listening, roster, served.set_result))
-        async with async_playwright() as playwright:
-            chromium = await playwright.chromium.launch(executable_path=CHROMIUM, args=[*ARGUMENTS])
+        async with launched() as chromium:
             yield Browser(chromium, await served)
-            await chromium.close()
         serving.cancel()
         await asyncio.gather(serving, return_exceptions=True)
 

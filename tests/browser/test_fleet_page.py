@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import Callable
 from typing import Any
 
 import pytest
 
-from tests.browser.conftest import NARROW, WIDE, Browser, Feed, row
+from tests.browser.conftest import NARROW, WIDE, Browser, Feed, row, soon
 
 EVIL = "<img src=x onerror=alert(1)>"
 STATES = [
@@ -32,12 +30,6 @@ NOBODY_ANSWERS = """() => {
 CONTROLS = ["Filter robots", "established 6", "tcpudp 10", "Stop free", "Forget killed", "free", "zbridge fleet"]
 
 
-async def soon(condition: Callable[[], Any]) -> None:
-    async with asyncio.timeout(10):
-        while not condition():  # noqa: ASYNC110
-            await asyncio.sleep(0.02)
-
-
 @pytest.mark.parametrize(("size", "scheme"), [(WIDE, "light"), (NARROW, "dark")])
 async def test_every_state_of_a_robot_is_drawn_without_a_complaint_and_nothing_is_wider_than_the_page(
     browser: Browser, size: Any, scheme: str
@@ -52,8 +44,7 @@ async def test_every_state_of_a_robot_is_drawn_without_a_complaint_and_nothing_i
     assert seen == {each["name"] for each in STATES}
     assert await page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     assert await page.locator("img").count() == 0
-    await page.get_by_role("link", name="free").click()
-    assert "stop, drive" in await page.locator("dl").inner_text()
+    await browser.photograph(page, f"fleet-{scheme}")
     assert browser.complaints == []
 
 
@@ -87,13 +78,13 @@ async def test_stop_all_is_in_sight_on_every_page_and_a_click_leaves_it_without_
         assert await button.is_visible()
         box = await button.bounding_box()
         assert box["y"] + box["height"] < NARROW["height"] / 2
-        before = len(feed.asked)
+        before = len(feed.requests())
         await button.click()
-        await soon(lambda: len(feed.asked) > before)  # noqa: B023
+        await soon(lambda: len(feed.requests()) > before)  # noqa: B023
         await page.keyboard.press("Space")
         await page.keyboard.press("Enter")
         await page.wait_for_timeout(100)
-        assert feed.asked[before:] == [{"do": "stop_all"}]
+        assert feed.requests()[before:] == [{"do": "stop_all"}]
 
 
 async def test_escape_stops_whatever_has_the_focus_and_once_for_each_press(browser: Browser) -> None:

@@ -11,13 +11,16 @@ from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
+import msgpack
 import pytest
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from tests.client import Gateway, World
+from tests.client import Gateway, World, at, subscriptions
 from tests.ports import HOST
 from zbridge.errors import ConfigError, LinkError
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Status
 from zbridge.protocol.address import Address
 from zbridge.views.console import console, page, server
 from zbridge.views.console.roster import Roster
@@ -87,7 +90,8 @@ async def until(opened: ClientConnection, condition: Callable[[dict[str, Any]], 
     """Read messages until one meets a condition."""
     async with asyncio.timeout(10):
         while True:
-            message: dict[str, Any] = json.loads(await opened.recv())
+            received = await opened.recv()
+            message: dict[str, Any] = json.loads(received) if isinstance(received, str) else {}
             if condition(message):
                 return message
 
@@ -165,6 +169,71 @@ async def test_a_robot_that_was_there_is_missing_until_it_is_forgotten(scene: Sc
         assert (await until(opened, lambda message: message.get("gone")))["gone"] == ["r2"]
 
 
+async def robot_news(opened: ClientConnection, path: str) -> Any:
+    """Read what a robot published until a key comes; give the robot and the message."""
+    async with asyncio.timeout(10):
+        while True:
+            received = await opened.recv()
+            frame = msgpack.unpackb(received) if isinstance(received, bytes) else {"news": ()}
+            for news in frame["news"]:
+                if news[0] == path:
+                    return frame["robot"], msgpack.unpackb(news[3])
+
+
+async def test_a_page_gets_what_the_robot_publishes_that_it_looks_at(scene: Scene) -> None:
+    async with scene.page() as opened, scene.page() as other:
+        await opened.send(json.dumps({"do": "look", "robot": "r1"}))
+        await robot_news(opened, "status")
+        scene.world.pose(7.0)
+        scene.world.gateways["r2"].publish(topics.POSE, at(8.0))
+        robot, pose = await robot_news(opened, "pose")
+        assert (robot, pose["x"]) == ("r1", 7.0)
+        await opened.send(json.dumps({"do": "look", "robot": "r2"}))
+        assert (await robot_news(opened, "status"))[0] == "r2"
+        assert subscriptions(scene.world.bus, "fleet/r1/*") == 0
+        await opened.send(json.dumps({"do": "look"}))
+        await opened.send(json.dumps({"do": "stop", "robot": "r1"}))
+        await until(other, lambda message: notice(message, "one").get("good"))
+        assert subscriptions(scene.world.bus, "fleet/r2/*") == 0
+
+
+async def test_a_page_that_is_closed_looks_at_nothing(scene: Scene) -> None:
+    async with scene.page() as opened:
+        await opened.send(json.dumps({"do": "look", "robot": "r1"}))
+        await robot_news(opened, "status")
+    async with asyncio.timeout(5):
+        while subscriptions(scene.world.bus, "fleet/r1/*"):  # noqa: ASYNC110
+            await asyncio.sleep(0.01)
+
+
+async def test_who_drove_and_who_stopped_a_robot_is_told(scene: Scene) -> None:
+    async with scene.page() as opened:
+        await opened.send(json.dumps({"do": "look", "robot": "r1"}))
+        async with scene.world.others.control("ann"):
+            await opened.send(json.dumps({"do": "stop", "robot": "r1"}))
+            await until(opened, lambda message: notice(message, "one").get("good"))
+        await opened.send(json.dumps({"do": "look", "robot": "r1"}))
+        _, entries = await robot_news(opened, "@history")
+        assert [entry["text"] for entry in entries] == ["ann drives", "stopped by this console: ann no longer drives"]
+
+
+async def test_a_switch_is_sent_or_refused_by_what_the_robot_accepts(scene: Scene) -> None:
+    scene.world.gateway.publish(topics.STATUS, Status("established", commands=("stop", "light")))
+    async with scene.page() as opened:
+        for name in ("light", "lidar"):
+            await opened.send(json.dumps({"do": "switch", "robot": "r1", "name": name, "on": True}))
+            done = await until(opened, lambda message: notice(message, "one"))
+            good = name == "light"
+            assert notice(done, "one")["good"] is good
+    assert [name for name, _ in scene.world.machine.commands] == ["light"]
+
+
+async def test_a_page_hears_something_while_nothing_changes(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(console, "ALIVE_S", 0.0)
+    async with scene.page() as opened:
+        await until(opened, lambda message: message == {})
+
+
 @pytest.mark.parametrize("origin", [None, "http://evil.example", "http://127.0.0.1:1", "https://127.0.0.1", "null"])
 async def test_a_socket_of_another_page_is_refused(scene: Scene, origin: str | None) -> None:
     with pytest.raises(InvalidStatus) as refused:
@@ -196,9 +265,18 @@ async def test_files_beside_the_pages_are_not_served(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "[]", '{"do": "drive"}', '{"do": "stop", "more": 1}', "x" * (page.MOST_BYTES + 1)]
+    "text",
+    [
+        "",
+        "[]",
+        b"",
+        '{"do": "switch", "robot": "r1", "name": "drive"}',
+        '{"do": "drive"}',
+        '{"do": "stop", "more": 1}',
+        "x" * (page.MOST_BYTES + 1),
+    ],
 )
-async def test_a_page_that_sends_what_it_must_not_is_closed_and_others_stay(scene: Scene, text: str) -> None:
+async def test_a_page_that_sends_what_it_must_not_is_closed_and_others_stay(scene: Scene, text: str | bytes) -> None:
     async with scene.page() as good, scene.page() as bad:
         await bad.send(text)
         with pytest.raises(ConnectionClosed):

@@ -56,7 +56,7 @@ class ControlHistory:
 
     def open(self) -> None:
         """Follow all robots from now on."""
-        self._handle = self._bus.subscribe(f"{self._realm}/*/{topics.CONTROL.path}", self._take)
+        self._handle = self._bus.subscribe(f"{self._realm}/*/{topics.CONTROL.path}", self._take, history=True)
 
     def close(self) -> None:
         """Follow them no longer; idempotent."""

@@ -31,7 +31,7 @@ export function Facts({ row, data }) {
   const facts = [
     ["Protocol", `${row.protocol} ${row.version}`.trim()],
     ["Links", (data.message("status")?.links ?? []).map((link) => `${link.name}: ${link.state} ${link.peer}`).join("; ")],
-    ["Battery", battery && battery.level !== null ? `${Math.round(100 * battery.level)} %${battery.charging ? ", charging" : ""}` : ""],
+    ["Battery", Number.isFinite(battery?.level) ? `${Math.round(100 * battery.level)} %${battery.charging ? ", charging" : ""}` : ""],
     ["Temperature", Number.isFinite(data.message("motion")?.temperature) ? `${data.message("motion").temperature.toFixed(1)} °C` : ""],
     ["Accepts", row.commands.join(", ")],
     ["Refused commands", row.refused],
@@ -68,7 +68,7 @@ export function Sensors({ data }) {
   return html`<${Panel} title="Sensors"><dl class="tight">
     ${sensors.slice(0, ROWS).map(([name, path]) => {
       const reading = data.message(path);
-      const value = Number.isFinite(reading?.value) ? reading.value.toFixed(3) : "not a number";
+      const value = reading ? reading.value.toFixed(3) : "cannot be read";
       const age = data.isOld(path) ? html` <span class="age">${Math.round(data.age(path))} s old</span>` : "";
       return html`<dt>${name}</dt><dd>${value} ${reading?.kind ?? ""}${reading?.fault ? " (not plausible)" : ""}${age}</dd>`;
     })}
@@ -92,22 +92,15 @@ export function Refusals({ data }) {
   return html`<${Panel} title="Refused lately"><${Rows} items=${refusals} row=${row} none="" /><//>`;
 }
 
-export function Sessions({ data, unpack }) {
-  const tables = data.message("@sessions");
-  const sessions = Object.entries(tables ?? {}).flatMap(([process, payload]) => {
-    try {
-      return unpack(payload).sessions.map((session) => ({ process, ...session }));
-    } catch {
-      return [];
-    }
-  });
+export function Sessions({ data }) {
+  const sessions = data.message("@sessions");
   const row = (each) => html`<li class=${each.state === "established" ? "" : "ended"}>
     <b>${each.name}</b> ${[each.peer, each.transport, each.version && `version ${each.version}`].filter(Boolean).join(", ")}: ${each.state}
     ${each.reason ? ` (${each.reason})` : ""}
     <span class="empty"> ${each.process === "gateway" ? "" : each.process}</span>
   </li>`;
   return html`<${Panel} title="Sessions">
-    <${Rows} items=${sessions} row=${row} none=${tables ? "No process reports any." : "Asking its gateway."} />
+    <${Rows} items=${sessions ?? []} row=${row} none=${sessions ? "No process reports any." : "Asking its gateway."} />
   <//>`;
 }
 

@@ -5,6 +5,7 @@ import { MINUTES_S } from "./robot_data.js";
 
 const MOST = 8; // lines of one plot
 const HEIGHT = 150;
+const LABEL = 24; // characters of a label
 const loading = () => import("./vendor/uplot.js").then((module) => module.default);
 
 // The values that plots show now, by name. The part before ":" is the plot.
@@ -15,7 +16,7 @@ export function readValues(data) {
   if (Number.isFinite(speed)) values["speed:% of full scale"] = 100 * speed;
   else values["speed:m/s by its pose"] = data.away ? null : data.speedByPose();
   const battery = current("battery");
-  if (battery && battery.level !== null) values["sensors:battery %"] = 100 * battery.level;
+  if (Number.isFinite(battery?.level)) values["sensors:battery %"] = 100 * battery.level;
   for (const [name, path] of data.sensors().slice(0, MOST)) {
     const reading = current(path);
     values[`sensors:${name}`] = reading && !reading.fault ? reading.value : null;
@@ -63,7 +64,7 @@ function options(labels, width) {
   const style = getComputedStyle(document.documentElement);
   const color = (name) => style.getPropertyValue(name).trim();
   const axis = { stroke: color("--dim"), grid: { stroke: color("--line"), width: 1 }, ticks: { stroke: color("--line"), width: 1 } };
-  const line = (label, index) => ({ label, stroke: color(`--line-${index + 1}`), width: 1.5, points: { show: false } });
+  const line = (label, index) => ({ label: label.slice(0, LABEL), stroke: color(`--line-${index + 1}`), width: 1.5, points: { show: false } });
   return {
     width,
     height: HEIGHT,

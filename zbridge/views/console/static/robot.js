@@ -3,7 +3,6 @@
 import { html, useEffect, useRef, useState } from "./vendor/htm-preact.js";
 import { leave } from "./header.js";
 import { since, tone } from "./fleet.js";
-import { unpack } from "./msgpack.js";
 import { Plots, readValues } from "./plots.js";
 import { Facts, History, Published, Refusals, Sensors, Sessions, Switches, Texts } from "./panels.js";
 import { RobotData } from "./robot_data.js";
@@ -39,7 +38,7 @@ export function Robot({ store, name }) {
         <${Refusals} data=${data} />
         <${History} data=${data} />
         <${Sensors} data=${data} />
-        <${Sessions} data=${data} unpack=${unpack} />
+        <${Sessions} data=${data} />
         <${Texts} data=${data} />
       </div>
     </div>

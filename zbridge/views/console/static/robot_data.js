@@ -1,6 +1,7 @@
 // What is known of the robot that the page looks at: its newest messages, their ages, its trail and its last minutes.
 
-import { floats, unpack } from "./msgpack.js";
+import { readMessage } from "./messages.js";
+import { unpack } from "./msgpack.js";
 
 export const MINUTES_S = 120; // how far plots go back
 const SAMPLE_S = 0.25;
@@ -53,25 +54,18 @@ export class RobotData {
   }
 
   takeOne(path, came, period, payload) {
-    let message;
-    try {
-      message = unpack(payload);
-    } catch {
-      message = null; // malformed: the key is shown without content
-    }
+    const message = readMessage(path, payload);
     if (path === "text") {
       if (message) this.texts.push({ came, ...message });
       if (this.texts.length > TEXTS) this.texts.shift();
       return;
     }
-    if (path === "scan" && message) message.ranges = floats(message.ranges);
     this.entries.set(path, { came, period, message });
     if (path === "pose" && message) this.takePose(message);
   }
 
   takePose({ x, y, heading, stamp_ns }) {
-    if (![x, y, heading].every(Number.isFinite)) return;
-    const pose = { x, y, heading, at: (stamp_ns ?? 0) / 1e9 };
+    const pose = { x, y, heading, at: seconds(stamp_ns) };
     this.poses.push(pose);
     while (pose.at - this.poses[0].at > 1 || this.poses.length > 50) this.poses.shift();
     const last = this.trail.at(-1);
@@ -108,7 +102,7 @@ export class RobotData {
   poseAt(stamp_ns) {
     const newest = this.poses.at(-1);
     if (!newest) return null;
-    const at = (stamp_ns ?? 0) / 1e9;
+    const at = seconds(stamp_ns);
     const later = this.poses.findIndex((pose) => pose.at >= at);
     if (later <= 0) return later < 0 || !at ? newest : this.poses[0];
     const [a, b] = [this.poses[later - 1], this.poses[later]];
@@ -147,6 +141,8 @@ export class RobotData {
     }
   }
 }
+
+const seconds = (stamp_ns) => (Number.isFinite(stamp_ns) ? stamp_ns / 1e9 : 0);
 
 function sensorName(chunk) {
   if (chunk === "%") return "(unnamed)";

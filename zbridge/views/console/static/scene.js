@@ -149,7 +149,7 @@ export class Scene {
     this.drawGrid(context, width, height);
     this.drawMap(context);
     this.drawTrail(context);
-    this.drawScan(context);
+    this.drawScan(context, view, ratio);
     this.drawRobot(context, pose);
     canvas.dataset.view = JSON.stringify(view); // tests compare pixels with the simulated room
   }
@@ -185,7 +185,7 @@ export class Scene {
   drawMap(context) {
     const message = this.data.message("map");
     const old = this.data.isOld("map") || this.data.away;
-    if (!message?.rows || message.cells?.length !== message.rows * message.columns) return;
+    if (!message?.cells.length) return;
     if (this.map.message !== message || this.map.old !== old) {
       this.map = { message, old, image: mapImage(message, this.palette(old)) };
     }
@@ -206,18 +206,22 @@ export class Scene {
     this.stroke(context, this.data.isOld("pose") || this.data.away ? this.colors.old : this.colors.trail, 2);
   }
 
-  drawScan(context) {
+  // Points are whole pixels: they stay sharp, whatever the zoom.
+  drawScan(context, view, ratio) {
     const scan = this.data.message("scan");
     if (!scan) return;
     const pose = this.data.poseAt(scan.stamp_ns) ?? { x: 0, y: 0, heading: 0 };
-    const side = Math.max(3 / this.scale, 0.02);
+    const side = Math.round(3 * ratio);
+    context.setTransform(1, 0, 0, 1, 0, 0);
     context.fillStyle = this.data.isOld("scan") || this.data.away ? this.colors.old : this.colors.scan;
     scan.ranges.forEach((range, index) => {
-      if (!(range >= scan.range_min && range <= scan.range_max)) return;
+      if (!(range >= scan.range_min && range < scan.range_max)) return; // at the end of the range nothing was seen
       const angle = pose.heading + scan.angle_min + index * scan.angle_increment;
       const [x, y] = [pose.x + range * Math.cos(angle), pose.y + range * Math.sin(angle)];
-      context.fillRect(x - side / 2, y - side / 2, side, side);
+      const [right, down] = [view[0] * x + view[2] * y + view[4], view[1] * x + view[3] * y + view[5]];
+      context.fillRect(Math.round(right - side / 2), Math.round(down - side / 2), side, side);
     });
+    context.setTransform(...view);
   }
 
   drawRobot(context, pose) {

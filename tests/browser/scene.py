@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-_READ = """colors => {
+MOST = 2000
+"""Most pixels of a colour that are given, spread evenly."""
+_READ = """([colors, MOST]) => {
   const canvas = document.querySelector('.picture canvas');
   const { width, height } = canvas;
   const back = new DOMMatrix(JSON.parse(canvas.dataset.view)).inverse();
@@ -20,6 +22,8 @@ _READ = """colors => {
       const { x, y } = back.transformPoint({ x: (index % width) + 0.5, y: Math.floor(index / width) + 0.5 });
       found[name].push([x, y]);
     }
+    const every = Math.ceil(found[name].length / MOST);
+    if (every > 1) found[name] = found[name].filter((_, index) => index % every === 0);
   }
   return found;
 }"""
@@ -30,7 +34,7 @@ Places = list[tuple[float, float]]
 async def places(page: Any, *colors: str) -> dict[str, Places]:
     """Give the places, in metres, of the pixels that have these colours of the scene."""
     await page.locator(".picture canvas[data-view]").wait_for()
-    found: dict[str, Places] = await page.evaluate(_READ, list(colors))
+    found: dict[str, Places] = await page.evaluate(_READ, [list(colors), MOST])
     return found
 
 

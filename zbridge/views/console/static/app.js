@@ -2,11 +2,16 @@
 
 import { html, render } from "./vendor/htm-preact.js";
 import { Fleet } from "./fleet.js";
-import { Robot } from "./robot.js";
 import { Header } from "./header.js";
 import { Store } from "./store.js";
 
 let scheduled = false;
+let Robot = null; // loaded with the first page of a robot: the fleet is painted sooner
+
+async function loadRobot() {
+  ({ Robot } = await import("./robot.js"));
+  draw();
+}
 
 function draw() {
   if (scheduled) return;
@@ -15,7 +20,8 @@ function draw() {
     scheduled = false;
     const name = location.hash.startsWith("#/robot/") ? decodeURIComponent(location.hash.slice(8)) : null;
     document.title = `${name ?? store.realm ?? "fleet"} - zbridge console`;
-    const page = name === null ? html`<${Fleet} store=${store} />` : html`<${Robot} store=${store} name=${name} />`;
+    if (name !== null && !Robot) loadRobot();
+    const page = name === null ? html`<${Fleet} store=${store} />` : Robot && html`<${Robot} store=${store} name=${name} />`;
     render(html`<${Header} store=${store} /><main>${page}</main>`, document.body);
   });
 }

@@ -6,7 +6,12 @@ import { MINUTES_S } from "./robot_data.js";
 const MOST = 8; // lines of one plot
 const HEIGHT = 150;
 const LABEL = 24; // characters of a label
-const loading = () => import("./vendor/uplot.js").then((module) => module.default);
+
+async function loadPlot() {
+  const link = Object.assign(document.createElement("link"), { rel: "stylesheet", href: "/static/vendor/uplot.css" });
+  if (!document.querySelector(`link[href="${link.getAttribute("href")}"]`)) document.head.append(link);
+  return (await import("./vendor/uplot.js")).default;
+}
 
 // The values that plots show now, by name. The part before ":" is the plot.
 export function readValues(data) {
@@ -38,7 +43,7 @@ function Plot({ name, title, data }) {
   const lines = [...data.history.series].filter(([line, values]) => line.startsWith(`${name}:`) && values.some((each) => each !== null));
   const labels = lines.map(([line]) => line.slice(name.length + 1));
   const shape = labels.join("\n");
-  useEffect(() => void loading().then((loaded) => setUPlot(() => loaded)), []);
+  useEffect(() => void loadPlot().then((loaded) => setUPlot(() => loaded)), []);
   useEffect(() => {
     if (!uPlot || !labels.length) return undefined;
     const place = box.current;

@@ -11,7 +11,7 @@ import pytest
 from tests.client import World
 from zbridge.client.pilot import STALE_S, Pilot
 from zbridge.errors import LeaseLost, NeutralFirst, NotReady, RateLimited, ZbridgeError
-from zbridge.fleet.messages import Drive, Mode
+from zbridge.fleet.messages import Drive, Mode, Motor
 from zbridge.lease.stick import Stick, StickRules
 
 pytestmark = pytest.mark.jumping
@@ -219,7 +219,7 @@ async def test_a_lease_that_is_not_granted_is_told_once(scene: Scene) -> None:
 async def test_a_bus_that_breaks_under_a_command_ends_the_lease(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     await scene.held()
 
-    def broken(_: Drive) -> bool:
+    def broken(*_: object) -> bool:
         raise OSError("no bus")
 
     monkeypatch.setattr(scene.driver, "now", broken)
@@ -243,6 +243,21 @@ async def test_a_mode_keeps_the_lease_and_drives_do_not_overtake_it(scene: Scene
     await scene.pilot.set_mode("none")
     await asyncio.sleep(1.2)
     assert (scene.holder, scene.ended) == (None, [None])
+
+
+async def test_single_motors_are_moved_by_the_lease_and_need_neutral_as_drives_do(scene: Scene) -> None:
+    scene.make(BY_HAND)
+    scene.pilot.motor("left wheel", 2.0)
+    await asyncio.sleep(0.1)
+    scene.pilot.motor("left wheel", 0.0)
+    scene.pilot.require_neutral("stop")
+    with pytest.raises(NeutralFirst, match="stop"):
+        scene.pilot.motor("left wheel", 2.0)
+    scene.pilot.rest()
+    scene.pilot.motor("lift", 0.1)
+    moved = [(name, command.value) for name, command in scene.world.machine.commands if isinstance(command, Motor)]
+    assert moved == [("motor/left%20wheel", 2.0), ("motor/left%20wheel", 0.0), ("motor/lift", 0.1)]
+    assert scene.holder == "ann"
 
 
 async def test_modes_that_wait_are_bounded_and_end_with_the_lease() -> None:

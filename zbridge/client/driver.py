@@ -135,14 +135,14 @@ class Driver:
         """Send a legacy message that no fleet message represents."""
         await self._send(topics.CMD_RAW(protocol), Raw(id=message_id, body=body))
 
-    def now(self, drive: Drive) -> bool:
-        """Send a drive without waiting, for callbacks; raise as a call does.
+    def now(self, command: Drive | Motor, topic: Topic = topics.CMD_DRIVE) -> bool:
+        """Send a drive, or a motor's command on its topic, without waiting, for callbacks; raise as a call does.
 
         False: nothing was sent, because it must not overtake another command in transit.
         """
         if self._lock.locked():
             return False
-        refusal, _ = self._put(topics.CMD_DRIVE, drive, self._clock_ms())
+        refusal, _ = self._put(topic, command, self._clock_ms())
         if refusal is not None:
             raise refusal
         return True

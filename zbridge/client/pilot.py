@@ -2,7 +2,7 @@
 
 Theory of operation. The stick (:mod:`zbridge.lease.stick`) decides, and the pilot acts. A task holds the lease
 from ACQUIRE on; it ends with the lease. While the lease is held, a drive is sent within :meth:`Pilot.drive`. The newest
-drive waits for the lease, or for a mode in transit, for at most :data:`STALE_S`. A timer serves the stick's
+command waits for the lease, or for a mode in transit, for at most :data:`STALE_S`. A timer serves the stick's
 deadlines.
 
 A lease that ends without :meth:`Pilot.release` is reported once, and the stick then needs neutral. A refused command
@@ -19,7 +19,9 @@ from contextlib import AbstractAsyncContextManager
 
 from zbridge.client.driver import Driver
 from zbridge.errors import BusError, LeaseLost, NeutralFirst, RateLimited, Refused, ZbridgeError, describe
-from zbridge.fleet.messages import Drive
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Drive, Motor
+from zbridge.fleet.topics import Topic
 from zbridge.lease.stick import Stick, StickAction
 
 STALE_S = 0.4
@@ -54,8 +56,8 @@ class Pilot:
         self._loop = asyncio.get_running_loop()
         self._driver: Driver | None = None
         """While the lease is held."""
-        self._waiting: tuple[Drive, float] | None = None
-        """The newest drive that could not be sent, and when it came."""
+        self._waiting: tuple[Topic, Drive | Motor, float] | None = None
+        """The newest command that could not be sent, and when it came."""
         self._granted: asyncio.Future[Driver] = self._loop.create_future()
         self._setting = 0
         """Modes that are not set yet."""
@@ -69,14 +71,25 @@ class Pilot:
 
     def drive(self, drive: Drive) -> None:
         """Take a position of the stick; raise NeutralFirst if neutral is needed, Refused as the robot's gateway did."""
+        self._command(topics.CMD_DRIVE, drive)
+
+    def motor(self, name: str, value: float) -> None:
+        """Move one motor (rad/s, or metres for a linear motor) as :meth:`drive` moves the robot; 0 is neutral."""
+        self._command(topics.CMD_MOTOR(name), Motor(value))
+
+    def rest(self) -> None:
+        """Take a centred stick without a command: of a robot that accepts no drive, and whose motors were not moved."""
+        self.stick.neutral(self._loop.time())
+
+    def _command(self, topic: Topic, command: Drive | Motor) -> None:
         now = self._loop.time()
         self._expire(now)
         self.stick.heard(now)
-        action = self.stick.motion(now) if drive.moving else self.stick.neutral(now)
+        action = self.stick.motion(now) if command.moving else self.stick.neutral(now)
         if action is StickAction.SEND:
-            self._send(drive, now)
+            self._send(topic, command, now)
         elif action is not StickAction.NOTHING:
-            self._waiting = (drive, now)
+            self._waiting = (topic, command, now)
             if action is StickAction.ACQUIRE:
                 self._begin()
         self._arm()
@@ -173,16 +186,16 @@ class Pilot:
         if self._waiting is not None and self._driver is not None:
             self._send(*self._waiting)
 
-    def _send(self, drive: Drive, came_at: float) -> None:
-        """Send a drive, or let it wait; raise Refused if the lease outlasts that."""
-        assert self._driver is not None, "a drive without a lease"
+    def _send(self, topic: Topic, command: Drive | Motor, came_at: float) -> None:
+        """Send a command, or let it wait; raise Refused if the lease outlasts that."""
+        assert self._driver is not None, "a command without a lease"
         self._waiting = None
         stale = self._loop.time() - came_at >= STALE_S
-        if stale or (drive.moving and self.stick.needs_neutral is not None):
+        if stale or (command.moving and self.stick.needs_neutral is not None):
             return
         try:
-            if self._setting or not self._driver.now(drive):
-                self._waiting = (drive, came_at)
+            if self._setting or not self._driver.now(command, topic):
+                self._waiting = (topic, command, came_at)
         except Exception as error:
             if self._outlasts(error):
                 raise

@@ -4,54 +4,27 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import http.client
 import json
 import socket
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import msgpack
 import pytest
-from websockets.asyncio.client import ClientConnection, connect
+from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from tests.client import Gateway, World, at, subscriptions
+from tests.client import Gateway, at, subscriptions
 from tests.ports import HOST
+from tests.views.console.conftest import Scene
 from zbridge.errors import ConfigError, LinkError
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Status
 from zbridge.protocol.address import Address
 from zbridge.views.console import console, page, server
-from zbridge.views.console.roster import Roster
 
 CONFIRMED = "stopped (their gateways sent it)"
-
-
-class Scene:
-    """Two robots, and a console for them."""
-
-    def __init__(self, world: World, at: str, roster: Roster) -> None:
-        self.world, self.at, self.roster = world, at.removeprefix("http://"), roster
-
-    async def get(self, path: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
-        """Get a path over a connection of its own."""
-
-        def ask() -> tuple[int, dict[str, str], bytes]:
-            connection = http.client.HTTPConnection(self.at, timeout=5)
-            with contextlib.closing(connection):
-                connection.request("GET", path, headers={"Host": self.at, **headers})
-                answer = connection.getresponse()
-                return answer.status, {name.lower(): value for name, value in answer.getheaders()}, answer.read()
-
-        return await asyncio.to_thread(ask)
-
-    @contextlib.asynccontextmanager
-    async def page(self, **options: Any) -> AsyncIterator[ClientConnection]:
-        """Open a socket as a page of the console does."""
-        options = {"origin": f"http://{self.at}", "proxy": None, **options}
-        async with connect(f"ws://{self.at}/socket", **options) as opened:
-            yield opened
 
 
 def states(message: dict[str, Any]) -> list[tuple[str, str]]:
@@ -69,21 +42,6 @@ def notice(message: dict[str, Any], of: str) -> dict[str, Any]:
     """What a message says of a stop of ``all``, or of ``one`` robot; nothing if it does not."""
     found: dict[str, Any] = message.get("notices", {}).get(of) or {}
     return found
-
-
-@pytest.fixture
-async def scene(tmp_path: Path) -> AsyncIterator[Scene]:
-    world, roster = World("r1", "r2"), Roster(tmp_path / "fleet.roster")
-    served: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-    with contextlib.closing(server.listener(Address(HOST, 0))) as listening:
-        serving = asyncio.create_task(
-            server.serve(world.fleet, world.bus.join("console"), listening, roster, served.set_result)
-        )
-        try:
-            yield Scene(world, await served, roster)
-        finally:
-            serving.cancel()
-            await asyncio.gather(serving, return_exceptions=True)
 
 
 async def until(opened: ClientConnection, condition: Callable[[dict[str, Any]], Any]) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import math
 import time
 from collections.abc import Coroutine
@@ -19,13 +20,17 @@ from zbridge.client.fleet_model import FleetModel
 from zbridge.client.stops import new_stop, summarize
 from zbridge.errors import ZbridgeError
 from zbridge.fleet.messages import Stop
+from zbridge.fleet.topics import is_name
+from zbridge.metrics import Metrics
 from zbridge.tasks import Tasks
+from zbridge.views.console.drive_socket import DriveSocket
 from zbridge.views.console.feed import FleetFeed
 from zbridge.views.console.fleet_stop import StopReport, listed, stop_fleet
 from zbridge.views.console.history import ControlHistory
 from zbridge.views.console.page import Page, Request
 from zbridge.views.console.robot_watch import RobotWatches
 from zbridge.views.console.roster import Roster
+from zbridge.views.console.seats import Seat, Seats
 
 REFRESH_S = 0.5
 """Seconds between two looks at the fleet."""
@@ -39,7 +44,9 @@ SAME_PRESS_S = 0.3
 """Seconds within which two presses of STOP ALL are one: nobody was released in between."""
 RELEASED_S = 1.0
 """Seconds after a release until robots have shown whether they are still latched."""
-_FULL = 1013
+DRIVES = 32
+"""Most pages that drive, or want to, at a time."""
+_FULL, _NO_NAME = 1013, 1008
 _encode = msgspec.json.Encoder().encode
 
 
@@ -71,6 +78,10 @@ class Console:
         self._told_at = -math.inf
         self._history = ControlHistory(bus, fleet.realm, self._history_changed)
         self._watches = RobotWatches(bus, fleet.realm, self._history.payload)
+        self._seats = Seats()
+        self._drives = 0
+        self._numbers = itertools.count(1)
+        self.metrics = Metrics()
 
     def __repr__(self) -> str:
         return f"<Console {self._feed!r}, {len(self._pages)} pages>"
@@ -100,8 +111,30 @@ class Console:
             self._pages.discard(page)
             self._look(page, "")
 
+    async def drive(self, socket: WebSocket) -> None:
+        """Serve the socket by which a page drives a robot."""
+        robot = socket.path_params["robot"]
+        if not is_name(robot) or self._drives >= DRIVES:
+            why = (_NO_NAME, "this is no robot's name") if self._drives < DRIVES else (_FULL, f"{DRIVES} pages drive")
+            await socket.close(*why)
+            return
+        await socket.accept()
+        name = self._fleet.name or "console"
+        who = f"{name}.browser{next(self._numbers)}"
+        seat = Seat(self._fleet, robot, who, name, "", lambda: self._accepts(robot))
+        self._drives += 1
+        try:
+            await DriveSocket(socket, seat, self._seats, self.metrics).serve()
+        finally:
+            self._drives -= 1
+
+    def _accepts(self, robot: str) -> tuple[str, ...]:
+        entry = self._model.robots.get(robot)
+        return entry.status.commands if entry is not None and entry.status is not None else ()
+
     async def close(self) -> None:
-        """Wait for the stops that are on their way."""
+        """Give back all robots, and wait for the stops that are on their way."""
+        await self._seats.close()
         fleet = [task for task in (self._stopping, self._releasing) if task is not None]
         await asyncio.gather(*fleet, *self._work.running, return_exceptions=True)
 

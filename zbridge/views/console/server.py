@@ -72,6 +72,7 @@ def _application(console: Console) -> Starlette:
     routes = [
         Route("/", index),
         WebSocketRoute("/socket", console.serve),
+        WebSocketRoute("/drive/{robot}", console.drive),
         Mount("/static", StaticFiles(directory=_STATIC)),
     ]
     app = Starlette(routes=routes)
@@ -92,6 +93,7 @@ async def _served(app: Guard, listening: socket.socket) -> AsyncIterator[None]:
             server_header=False,
             ws="websockets-sansio",
             ws_max_size=MOST_BYTES,
+            ws_per_message_deflate=False,  # on loopback it costs more than it saves
             timeout_graceful_shutdown=1,
         )
     )

@@ -40,23 +40,24 @@ _Count = Annotated[int, msgspec.Meta(ge=0, lt=2**53)]
 
 
 class MotorCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One motor: rad/s, or metres for a linear motor."""
+    """One motor: rad/s, or metres for a linear one, which stays where it is when it is no longer commanded."""
 
     name: Annotated[str, msgspec.Meta(max_length=100)]
     value: Finite
+    linear: bool = False
 
 
 class DriveCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag="drive"):
     """What a page commands, 20 times a second and at each change. seq: rises. tick: the newest that it received.
 
-    epoch: rises when the page regains the focus or its gamepads change; why: which of them it was last. Fractions of
-    full scale, ``turn`` counter-clockwise. motor: moves one motor instead.
+    epoch: rises when the page regains the focus or a usable connection, or its gamepads change; why: which of them it
+    was last. Fractions of full scale, ``turn`` counter-clockwise. motor: moves one motor instead.
     """
 
     seq: _Count
     tick: _Count
     epoch: _Count = 0
-    why: Literal["", "focus", "gamepad"] = ""
+    why: Literal["", "focus", "gamepad", "link"] = ""
     forward: Fraction = 0.0
     left: Fraction = 0.0
     turn: Fraction = 0.0
@@ -90,7 +91,11 @@ class Due(Enum):
     SILENT = "silent"
 
 
-_WHY = {"focus": "the page was out of focus", "gamepad": "the gamepads have changed"}
+_WHY = {
+    "focus": "the page was out of focus",
+    "gamepad": "the gamepads have changed",
+    "link": "the connection to this page was slow",
+}
 
 
 class DriveLink:

@@ -55,7 +55,7 @@ class Seat:
         self._accepts = accepts
         self._pilot: Pilot | None = None
         self._motor: str | None = None
-        """The motor that was moved last, of a robot that accepts no drive."""
+        """The motor that was moved last, if it turns until it is sent 0."""
         self._work = Tasks()
 
     def __repr__(self) -> str:
@@ -106,7 +106,7 @@ class Seat:
         needed, self.notice = self._pilot.stick.needs_neutral, None
         try:
             if motor is not None:
-                self._motor = motor.name
+                self._motor = motor.name if not motor.linear else None
                 self._pilot.motor(motor.name, motor.value)
             elif "drive" in self._accepts():
                 self._pilot.drive(drive)

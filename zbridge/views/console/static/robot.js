@@ -3,6 +3,8 @@
 import { html, useEffect, useRef, useState } from "./vendor/htm-preact.js";
 import { leave } from "./header.js";
 import { since, tone } from "./fleet.js";
+import { Drive } from "./drive.js";
+import { DrivePanel } from "./drive_panel.js";
 import { Plots, readValues } from "./plots.js";
 import { Facts, History, Published, Refusals, Sensors, Sessions, Switches, Texts } from "./panels.js";
 import { RobotData } from "./robot_data.js";
@@ -16,6 +18,7 @@ export function Robot({ store, name }) {
   const row = store.rows.get(name);
   const [, turn] = useState(0);
   const data = useRobot(store, name, () => turn((count) => count + 1));
+  const drive = useDrive(store, name);
   if (!row) {
     return html`<section class="robot">
       <h1>${name}</h1>
@@ -28,6 +31,7 @@ export function Robot({ store, name }) {
     <div class="columns">
       <div class="views">
         <${Picture} data=${data} />
+        ${drive && html`<${DrivePanel} drive=${drive} row=${row} data=${data} />`}
         <${Camera} data=${data} />
         <${Plots} data=${data} />
       </div>
@@ -65,6 +69,17 @@ function useRobot(store, name, redraw) {
     };
   }, [name]);
   return data.current;
+}
+
+// Drives the robot of this page, while the page shows it.
+function useDrive(store, name) {
+  const [drive, setDrive] = useState(null);
+  useEffect(() => {
+    const made = new Drive(name, store);
+    setDrive(made);
+    return () => made.close();
+  }, [name]);
+  return drive?.robot === name ? drive : null;
 }
 
 function Title({ row, store }) {

@@ -74,10 +74,17 @@ class Lane:
         assert not [drive for drive in self.robot.driven[count:] if drive.moving]  # type: ignore[attr-defined]
 
 
+async def publish_status(world: World) -> None:
+    """Publish the robot's status as a gateway does."""
+    while True:
+        world.gateway.publish(topics.STATUS, Status("established", commands=COMMANDS))
+        await asyncio.sleep(0.5)
+
+
 @pytest.fixture
 async def lane(tmp_path: Path) -> AsyncIterator[Lane]:
     world = World("r1")
-    world.gateway.publish(topics.STATUS, Status("established", commands=COMMANDS))
+    publishing = asyncio.create_task(publish_status(world))
     served: asyncio.Future[str] = asyncio.get_running_loop().create_future()
     with contextlib.closing(server.listener(Address(HOST, 0))) as listening:
         serving = asyncio.create_task(
@@ -90,7 +97,8 @@ async def lane(tmp_path: Path) -> AsyncIterator[Lane]:
             yield made
             assert made.browser.complaints == []
         serving.cancel()
-        await asyncio.gather(serving, return_exceptions=True)
+        publishing.cancel()
+        await asyncio.gather(serving, publishing, return_exceptions=True)
 
 
 async def test_keys_drive_while_they_are_held_and_the_limit_counts(lane: Lane) -> None:

@@ -78,9 +78,9 @@ async def opened(browser: Browser, *, state: str = "free", **options: Any) -> tu
     return page, feed
 
 
-@pytest.mark.parametrize("state", STATES)
-async def test_every_state_is_drawn_without_a_complaint_wide_and_narrow(browser: Browser, state: str) -> None:
-    for size, scheme in ((WIDE, "light"), (NARROW, "dark")):
+@pytest.mark.parametrize(("size", "scheme"), [(WIDE, "light"), (NARROW, "dark")])
+async def test_every_state_is_drawn_without_a_complaint(browser: Browser, size: Any, scheme: str) -> None:
+    for state in STATES:
         page, feed = await opened(browser, state=state, size=size, scheme=scheme)
         feed.publish("r1", **FULL)
         await page.get_by_text("hello").wait_for()
@@ -90,6 +90,7 @@ async def test_every_state_is_drawn_without_a_complaint_wide_and_narrow(browser:
         assert await page.evaluate("document.querySelector('.robot').scrollWidth <= innerWidth")
         assert await page.locator("img").count() == 0
         await browser.photograph(page, f"robot-{state}-{scheme}")
+        await page.context.close()
     assert browser.complaints == []
 
 

@@ -3,21 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import math
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.browser.conftest import Browser, launched
+from tests.browser.rooms import room
 from tests.browser.scene import Places, middle, places
-from tests.e2e.conftest import Bench, device, until
-from tests.ports import HOST, free_port
-from zbridge.protocol.address import Address
-from zbridge.protocol.plugin import Simulation, find_protocol
 from zbridge.simulation.world import BOXES, HALF_SIDE_M, Body
-from zbridge.toml import as_toml
 
 PUBLISHED = {
     "tcpudp": {"map", "robot"},
@@ -53,45 +47,15 @@ def farthest(points: Places) -> float:
     return max(wall_distance(x, y) for x, y in points)
 
 
-@pytest.fixture
-def body(monkeypatch: pytest.MonkeyPatch, protocol: str) -> Body:
-    """The simulated robot, which the test knows."""
-    made = Body(*PLACES.get(protocol, (0.3, -0.2, 0.7)))
-    monkeypatch.setattr(Body, "somewhere", classmethod(lambda cls, rng, **more: made))
-    return made
-
-
-@contextlib.asynccontextmanager
-async def simulated(protocol: str) -> Any:
-    """Run a simulated robot; give the ports of its links."""
-    found, ready = find_protocol(protocol), asyncio.get_running_loop().create_future()
-    addresses = tuple(Address(HOST, free_port()) for _ in range(found.links))
-    running = asyncio.create_task(found.simulate(Simulation(addresses, seed=1, ready=ready.set_result)))
-    try:
-        yield [address.port for address in await ready]
-    finally:
-        running.cancel()
-        await asyncio.gather(running, return_exceptions=True)
-
-
 @pytest.mark.parametrize("protocol", PUBLISHED)
-async def test_map_scan_and_robot_are_where_they_are_in_the_room(tmp_path: Path, protocol: str, body: Body) -> None:
-    with contextlib.ExitStack() as stack:
-        bench = Bench(tmp_path, stack)
-        async with simulated(protocol) as ports, launched() as chromium:
-            options = find_protocol(protocol).simulated
-            lines = "\n".join(f"{name} = {as_toml(value)}" for name, value in options.items())
-            bench.gateway(device(ports[0], protocol, lines, *ports[1:]))
-            command = ("console", "--listen", f"{HOST}:0", "--roster", str(tmp_path / "roster"))
-            console = bench.zbridge(*command, "--connect", bench.endpoint)
-            assert console.stdout is not None
-            at = (await asyncio.to_thread(console.stdout.readline)).split()[-1]
-            await asyncio.to_thread(until, lambda: bench.fleet.state() == "established", 20.0, "established")
-            browser = Browser(chromium, at)
-            page = await browser.open("/#/robot/r1")
-            found = await drawn(page, PUBLISHED[protocol])
-            await browser.photograph(page, f"room-{protocol}")
-    assert browser.complaints == []
+async def test_map_scan_and_robot_are_where_they_are_in_the_room(
+    tmp_path: Path, protocol: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    body = Body(*PLACES.get(protocol, (0.3, -0.2, 0.7)))
+    async with room(protocol, tmp_path, monkeypatch, body) as scene:
+        page = await scene.browser.open("/#/robot/r1")
+        found = await drawn(page, PUBLISHED[protocol])
+        await scene.browser.photograph(page, f"room-{protocol}")
     if "map" in PUBLISHED[protocol]:
         assert farthest(found["occupied"]) < 0.16, "cells of 0.1 m, and one of noise"
         assert max(depth(x, y) for x, y in found["free"]) < 0.1, "free is what no box and no wall occupies"

@@ -90,11 +90,15 @@ class Feed:
         self._begin = {"full": True, "realm": "fleet", "bus": True, "notices": {}, "roster": None, **more}
         self._rows = rows
         self._socket: Any = None
+        self.quiet = False
+        """Whether it says nothing while nothing changes, as a console that hangs."""
+        self._alive: asyncio.Task[None] | None = None
 
     def __call__(self, socket: Any) -> None:
-        self._socket = socket
+        self._socket, self.quiet = socket, False
         socket.on_message(lambda text: self.asked.append(json.loads(text)))
         socket.send(json.dumps({**self._begin, "rows": self._rows}))
+        self._alive = asyncio.get_running_loop().create_task(self._stay_alive())
 
     def tell(self, **message: Any) -> None:
         self._socket.send(json.dumps(message))
@@ -122,7 +126,15 @@ class Feed:
         await soon(lambda: {"do": "look", "robot": robot} in self.asked)
 
     async def close(self) -> None:
+        self.quiet = True
         await self._socket.close()
+
+    async def _stay_alive(self) -> None:
+        with contextlib.suppress(Exception):  # the browser is gone
+            while True:
+                await asyncio.sleep(1.0)
+                if not self.quiet:
+                    self.tell()
 
 
 async def soon(condition: Callable[[], Any], within_s: float = 10.0) -> None:

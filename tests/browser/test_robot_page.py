@@ -348,6 +348,7 @@ async def test_a_console_that_hangs_is_not_taken_for_present_and_a_stop_without_
     browser: Browser,
 ) -> None:
     page, feed = await opened(browser)
+    feed.quiet = True
     await page.keyboard.press("Escape")
     await page.get_by_text("STOP ALL: the console has not answered yet").wait_for()
     await page.evaluate(

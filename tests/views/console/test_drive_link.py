@@ -14,15 +14,15 @@ from zbridge.views.console.drive_link import (
     SILENT_S,
     TICK_S,
     UNANSWERED,
-    DriveCommand,
     DriveLink,
     Drop,
     Due,
-    Verdict,
+    PageCommand,
+    PageVerdict,
 )
 
-NOTHING = Verdict()
-STALLED = Verdict(Drop.STALE, "the connection to this page stalled")
+NOTHING = PageVerdict()
+STALLED = PageVerdict(Drop.STALE, "the connection to this page stalled")
 
 
 class Page:
@@ -38,11 +38,11 @@ class Page:
         assert number is not None
         return number
 
-    def command(self, forward: float = 0.5, *, tick: int | None = None, **fields: object) -> DriveCommand:
+    def command(self, forward: float = 0.5, *, tick: int | None = None, **fields: object) -> PageCommand:
         self.seq += 1
-        return DriveCommand(self.seq, self.last_tick if tick is None else tick, forward=forward, **fields)  # type: ignore[arg-type]
+        return PageCommand(self.seq, self.last_tick if tick is None else tick, forward=forward, **fields)  # type: ignore[arg-type]
 
-    def send(self, forward: float = 0.5, **fields: object) -> Verdict:
+    def send(self, forward: float = 0.5, **fields: object) -> PageVerdict:
         """Send a command, which the robot is sent if it is accepted."""
         self.link.heard(self.now)
         command = self.command(forward, **fields)  # type: ignore[arg-type]
@@ -89,7 +89,7 @@ def test_a_command_counts_once_and_in_order() -> None:
     one, other = page.command(), page.command()
     assert page.link.take(other, page.now) == NOTHING
     for late in (one, other):
-        assert page.link.take(late, page.now) == Verdict(Drop.REPEATED)
+        assert page.link.take(late, page.now) == PageVerdict(Drop.REPEATED)
 
 
 def test_a_tick_that_was_never_sent_is_refused() -> None:
@@ -141,7 +141,7 @@ def test_after_a_gap_neutral_comes_first(silence_s: float, centre: bool) -> None
 def test_regained_focus_and_changed_gamepads_need_neutral_once(why: str, text: str) -> None:
     page = Page()
     page.send(epoch=3)
-    assert page.send(epoch=4, why=why) == Verdict(centre=text)
+    assert page.send(epoch=4, why=why) == PageVerdict(centre=text)
     assert page.send(epoch=4, why=why) == NOTHING
 
 
@@ -163,7 +163,7 @@ def test_random_commands_never_count_twice_nor_while_old() -> None:
         now += chance.expovariate(20.0)
         if (tick := link.tick(now)) is not None:
             sent[tick] = now
-        command = DriveCommand(chance.randrange(5000), chance.randrange(len(sent) + 2), forward=0.1)
+        command = PageCommand(chance.randrange(5000), chance.randrange(len(sent) + 2), forward=0.1)
         verdict = link.take(command, now)
         if verdict.drop is None:
             assert command.seq not in seen

@@ -30,7 +30,7 @@ class Driver:
         self.loss: Exception | None = None
         self.lost = asyncio.Event()
 
-    def now(self, drive: Drive) -> bool:
+    def now(self, drive: Drive, topic: object) -> bool:
         self._robot.done.append((drive.forward, drive.left, drive.turn))
         return True
 

@@ -47,7 +47,7 @@ class MotorCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     linear: bool = False
 
 
-class DriveCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag="drive"):
+class PageCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag="drive"):
     """What a page commands, 20 times a second and at each change. seq: rises. tick: the newest that it received.
 
     epoch: rises when the page regains the focus or a usable connection, or its gamepads change; why: which of them it
@@ -77,7 +77,7 @@ class Drop(Enum):
     UNKNOWN_TICK = "unknown_tick"
 
 
-class Verdict(msgspec.Struct, frozen=True):
+class PageVerdict(msgspec.Struct, frozen=True):
     """What is to be done with a command. drop: None if it is accepted. centre: why neutral must come before motion."""
 
     drop: Drop | None = None
@@ -131,17 +131,17 @@ class DriveLink:
         """Record that the page sent anything."""
         self._heard_at = now
 
-    def take(self, command: DriveCommand, now: float) -> Verdict:
+    def take(self, command: PageCommand, now: float) -> PageVerdict:
         """Judge a command."""
         if command.seq <= self._seq:
-            return Verdict(Drop.REPEATED)
+            return PageVerdict(Drop.REPEATED)
         self._seq = command.seq
         if command.tick > self._tick:
-            return Verdict(Drop.UNKNOWN_TICK, "the page named a tick that was never sent")
+            return PageVerdict(Drop.UNKNOWN_TICK, "the page named a tick that was never sent")
         self._answered = max(self._answered, command.tick)
         sent_at = self._sent_at.get(command.tick, -math.inf)
         if now - sent_at > FRESH_S:
-            return Verdict(Drop.STALE, "the connection to this page stalled")
+            return PageVerdict(Drop.STALE, "the connection to this page stalled")
         centre = None
         if now - self._accepted_at > GAP_S:
             centre = f"the page sent nothing for {GAP_S:g} s"
@@ -149,7 +149,7 @@ class DriveLink:
             centre = _WHY.get(command.why, "the page was changed")
         self._epoch, self._accepted_at = command.epoch, now
         self.acknowledged = (command.seq, now)
-        return Verdict(centre=centre)
+        return PageVerdict(centre=centre)
 
     def sent(self, *, moving: bool) -> None:
         """Record that the robot was sent motion, or neutral, or that its lease has ended."""

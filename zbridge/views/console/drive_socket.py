@@ -14,7 +14,7 @@ from zbridge.fleet.messages import Drive
 from zbridge.metrics import Metrics
 from zbridge.protocol.rate_limit import RateLimit
 from zbridge.tasks import race
-from zbridge.views.console.drive_link import TICK_S, DriveCommand, DriveLink, Due
+from zbridge.views.console.drive_link import TICK_S, DriveLink, Due, PageCommand
 from zbridge.views.console.seats import Seat, Seats
 
 log = logging.getLogger("zbridge.console")
@@ -47,7 +47,7 @@ class SetMode(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field
     mode: Literal["none", "manual", "autonomous"]
 
 
-_decode = msgspec.json.Decoder(DriveCommand | TakeControl | GiveControl | ResumeControl | SetMode).decode
+_decode = msgspec.json.Decoder(PageCommand | TakeControl | GiveControl | ResumeControl | SetMode).decode
 
 
 class DriveSocket:
@@ -112,7 +112,7 @@ class DriveSocket:
 
     def _take(self, message: Any, now: float) -> None:
         match message:
-            case DriveCommand():
+            case PageCommand():
                 self._drive(message, now)
             case TakeControl():
                 self._seat.take(takeover=message.takeover)
@@ -124,7 +124,7 @@ class DriveSocket:
             case SetMode():
                 self._seat.set_mode(message.mode)
 
-    def _drive(self, command: DriveCommand, now: float) -> None:
+    def _drive(self, command: PageCommand, now: float) -> None:
         if not self._seat.active:
             self._count("no_lease")
             return

@@ -22,7 +22,7 @@ from statistics import median
 
 from tests.benchmarks.fleet_scene import Routers
 from tests.benchmarks.harness import ROOT, BenchmarkError, cpu_s, memory_mb, process
-from tests.browser.conftest import CHROMIUM, launched
+from tests.browser.conftest import CHROMIUM, chromium
 
 CPU_GOAL, PAINT_GOAL_S, GROWTH_GOAL = 15.0, 0.6, 5.0
 """Per cent of a core; seconds; per cent of memory in an hour."""
@@ -118,9 +118,9 @@ def measure_stall(console: ConsoleProcess) -> bool:
 def measure_paint(console: ConsoleProcess) -> bool:
     async def paint() -> list[float]:
         times = []
-        async with launched() as chromium:
+        async with chromium() as running:
             for _ in range(PAINTS):
-                page = await (await chromium.new_context()).new_page()
+                page = await (await running.new_context()).new_page()
                 await page.goto(console.at)
                 await page.locator(".tall .row").first.wait_for()
                 entry = "performance.getEntriesByName('first-contentful-paint')[0].startTime / 1000"

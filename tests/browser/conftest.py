@@ -20,6 +20,7 @@ from typing import Any
 
 import msgpack
 import pytest
+import pytest_asyncio
 
 from tests.fake_bus import FakeBus
 from tests.ports import HOST
@@ -143,19 +144,33 @@ async def soon(condition: Callable[[], Any], within_s: float = 10.0) -> None:
             await asyncio.sleep(0.02)
 
 
+@pytest_asyncio.fixture(loop_scope="session", scope="session")
+async def launched() -> AsyncIterator[Any]:
+    """The Chromium of this worker."""
+    async with chromium() as running:
+        yield running
+
+
 @contextlib.asynccontextmanager
-async def launched(*more: str, **options: Any) -> AsyncIterator[Any]:
-    """Run a Chromium, when fewer than :data:`AT_ONCE` run."""
+async def chromium() -> AsyncIterator[Any]:
+    """Run a Chromium."""
     from playwright.async_api import async_playwright
 
+    async with async_playwright() as playwright:
+        running = await playwright.chromium.launch(executable_path=CHROMIUM, args=[*ARGUMENTS])
+        try:
+            yield running
+        finally:
+            await running.close()
+
+
+@pytest_asyncio.fixture(loop_scope="session")
+async def shared(launched: Any) -> AsyncIterator[Any]:
+    """The Chromium of this worker, when fewer than :data:`AT_ONCE` are used."""
     with await asyncio.to_thread(_turn):
-        async with async_playwright() as playwright:
-            arguments = [*ARGUMENTS, *more]
-            chromium = await playwright.chromium.launch(executable_path=CHROMIUM, args=arguments, **options)
-            try:
-                yield chromium
-            finally:
-                await chromium.close()
+        yield launched
+        for context in launched.contexts:
+            await context.close()
 
 
 def _turn() -> contextlib.AbstractContextManager[None]:
@@ -179,16 +194,15 @@ def _closing(files: list[Any]) -> Iterator[None]:
             file.close()
 
 
-@pytest.fixture
-async def browser(tmp_path: Any) -> AsyncIterator[Browser]:
-    """A Chromium before a console without robots."""
+@pytest_asyncio.fixture(loop_scope="session")
+async def browser(tmp_path: Any, shared: Any) -> AsyncIterator[Browser]:
+    """A browser before a console without robots."""
     served: asyncio.Future[str] = asyncio.get_running_loop().create_future()
     bus = FakeBus().join("console")
     with contextlib.closing(server.listener(Address(HOST, 0))) as listening:
         roster = Roster(tmp_path / "roster")
         serving = asyncio.create_task(server.serve(Fleet(bus), bus, listening, roster, served.set_result))
-        async with launched() as chromium:
-            yield Browser(chromium, await served)
+        yield Browser(shared, await served)
         serving.cancel()
         await asyncio.gather(serving, return_exceptions=True)
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from tests.browser.conftest import Browser, launched
+from tests.browser.conftest import Browser
 from tests.e2e.conftest import Bench, device, until
 from tests.ports import HOST, free_port
 from zbridge.protocol.address import Address
@@ -74,12 +74,12 @@ def configured(protocol: str, ports: list[int]) -> str:
 
 @contextlib.asynccontextmanager
 async def room(
-    protocol: str, folder: Path, monkeypatch: pytest.MonkeyPatch, body: Body, *parts: str
+    protocol: str, chromium: Any, folder: Path, monkeypatch: pytest.MonkeyPatch, body: Body, *parts: str
 ) -> AsyncIterator[Room]:
     """Run it all. parts: of the gateway's configuration, besides the device."""
     with contextlib.ExitStack() as stack:
         bench = Bench(folder, stack)
-        async with simulated(protocol, monkeypatch, body) as ports, launched() as chromium:
+        async with simulated(protocol, monkeypatch, body) as ports:
             bench.gateway(configured(protocol, ports), *parts)
             at = await console(bench, bench.endpoint)
             await asyncio.to_thread(until, lambda: bench.fleet.state() == "established", 20.0, "established")

@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import pytest_asyncio
 
-from tests.browser.conftest import Browser, launched, soon
+from tests.browser.conftest import Browser, soon
 from tests.client import Gateway, World
 from tests.ports import HOST
 from zbridge.fleet import topics
@@ -22,6 +23,8 @@ from zbridge.fleet.messages import Device, Devices, Drive, Mode, Motor, Status
 from zbridge.protocol.address import Address
 from zbridge.views.console import server
 from zbridge.views.console.roster import Roster
+
+pytestmark = pytest.mark.asyncio(loop_scope="session")
 
 COMMANDS = ("stop", "drive", "mode", "motor")
 ROBOT = "/#/robot/r1"
@@ -81,8 +84,8 @@ async def publish_status(world: World) -> None:
         await asyncio.sleep(0.5)
 
 
-@pytest.fixture
-async def lane(tmp_path: Path) -> AsyncIterator[Lane]:
+@pytest_asyncio.fixture(loop_scope="session")
+async def lane(tmp_path: Path, shared: Any) -> AsyncIterator[Lane]:
     world = World("r1")
     publishing = asyncio.create_task(publish_status(world))
     served: asyncio.Future[str] = asyncio.get_running_loop().create_future()
@@ -92,10 +95,9 @@ async def lane(tmp_path: Path) -> AsyncIterator[Lane]:
                 world.fleet, world.bus.join("console"), listening, Roster(tmp_path / "roster"), served.set_result
             )
         )
-        async with launched() as chromium:
-            made = Lane(world, Browser(chromium, await served))
-            yield made
-            assert made.browser.complaints == []
+        made = Lane(world, Browser(shared, await served))
+        yield made
+        assert made.browser.complaints == []
         serving.cancel()
         publishing.cancel()
         await asyncio.gather(serving, publishing, return_exceptions=True)

@@ -10,21 +10,23 @@ from typing import Any
 
 import pytest
 
-from tests.browser.conftest import Browser, launched
+from tests.browser.conftest import Browser
 from tests.browser.rooms import Room, configured, console, room, simulated
 from tests.e2e.conftest import Bench, Gateway, listener, repeated, until
 from tests.e2e.rigs.ros2_scene import RosScene
 from tests.ports import HOST, free_port
 from zbridge.simulation.world import Body
 
+pytestmark = pytest.mark.asyncio(loop_scope="session")
+
 ROBOT = "/#/robot/r1"
 
 
 @pytest.mark.parametrize("protocol", ["tcpudp", "alf", "wc2ec", "ros2"])
 async def test_keys_stick_and_gamepad_drive_a_robot_and_letting_go_stops_it(
-    tmp_path: Path, protocol: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, protocol: str, monkeypatch: pytest.MonkeyPatch, shared: Any
 ) -> None:
-    async with room(protocol, tmp_path, monkeypatch, Body(-1.0, 0.5, 0.3)) as scene:
+    async with room(protocol, shared, tmp_path, monkeypatch, Body(-1.0, 0.5, 0.3)) as scene:
         page = await scene.browser.open(ROBOT)
         await page.get_by_role("button", name="Take control").click()
         await page.get_by_text("Ready.").wait_for()
@@ -68,10 +70,10 @@ async def takes_over(scene: Room, other: str) -> Any:
 
 
 async def test_an_old_program_that_drives_is_seen_and_taken_over(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shared: Any
 ) -> None:
     port = free_port()
-    async with room("alf", tmp_path, monkeypatch, Body(0.0, 0.5, 0.3), listener("hq", "tcpudp", port)) as scene:
+    async with room("alf", shared, tmp_path, monkeypatch, Body(0.0, 0.5, 0.3), listener("hq", "tcpudp", port)) as scene:
         scene.bench.zbridge("simulate", "tcpudp", "--hq", f"tcp://{HOST}:{port}", "--drive", "0.3")
         page = await takes_over(scene, "hq")
         await page.get_by_role("heading", name="Refused lately").wait_for()  # what it still pushes
@@ -81,22 +83,22 @@ class RosRoom(RosScene):
     """ROS 2 beside a simulated robot."""
 
     @contextlib.asynccontextmanager
-    async def console(self, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Room]:
+    async def console(self, monkeypatch: pytest.MonkeyPatch, shared: Any) -> AsyncIterator[Room]:
         body, bench = Body(0.0, 0.5, 0.3), Bench(self.folder, self.stack)
-        async with simulated("alf", monkeypatch, body) as ports, launched() as chromium:
+        async with simulated("alf", monkeypatch, body) as ports:
             Gateway(self.stack, self.folder / "r1.toml", self.fleet_at, configured("alf", ports))
-            browser = Browser(chromium, await console(bench, self.fleet_at))
+            browser = Browser(shared, await console(bench, self.fleet_at))
             await asyncio.to_thread(self.told, "r1: state", "established")
             yield Room(bench, body, browser)
             assert browser.complaints == []
 
 
 async def test_a_ros_publisher_that_drives_is_seen_and_taken_over(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shared: Any
 ) -> None:
     with contextlib.ExitStack() as stack:
         ros = RosRoom(stack, tmp_path, "[robot.r1]\nspeed_full_mps = 0.5\nwheelbase_m = 0.3\n")
-        async with ros.console(monkeypatch) as scene:
+        async with ros.console(monkeypatch, shared) as scene:
             ended = asyncio.Event()
             pushing = asyncio.create_task(asyncio.to_thread(push, ros, ended))
             try:

@@ -8,6 +8,8 @@ import pytest
 
 from tests.browser.conftest import NARROW, WIDE, Browser, Feed, row, soon
 
+pytestmark = pytest.mark.asyncio(loop_scope="session")
+
 EVIL = "<img src=x onerror=alert(1)>"
 STATES = [
     row("away", "offline", 2, reason="connection refused", rate=None, commands=[]),

@@ -14,6 +14,8 @@ from tests.browser.conftest import NARROW, WIDE, Browser, Feed, row, soon
 from tests.browser.scene import middle, places
 from tests.browser.test_fleet_page import EVIL, NOBODY_ANSWERS
 
+pytestmark = pytest.mark.asyncio(loop_scope="session")
+
 NOW_NS = time.time_ns()
 POSE = {"x": 1.0, "y": 2.0, "heading": 0.5, "stamp_ns": NOW_NS}
 MAP = {"rows": 40, "columns": 40, "cell": 0.1, "origin": [-1.0, 0.0], "cells": bytes([1]) * 800 + bytes([2, 0]) * 400}

@@ -13,6 +13,8 @@ from tests.browser.rooms import room
 from tests.browser.scene import Places, middle, places
 from zbridge.simulation.world import BOXES, HALF_SIDE_M, Body
 
+pytestmark = pytest.mark.asyncio(loop_scope="session")
+
 PUBLISHED = {
     "tcpudp": {"map", "robot"},
     "alf": {"scan"},
@@ -49,10 +51,10 @@ def farthest(points: Places) -> float:
 
 @pytest.mark.parametrize("protocol", PUBLISHED)
 async def test_map_scan_and_robot_are_where_they_are_in_the_room(
-    tmp_path: Path, protocol: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, protocol: str, monkeypatch: pytest.MonkeyPatch, shared: Any
 ) -> None:
     body = Body(*PLACES.get(protocol, (0.3, -0.2, 0.7)))
-    async with room(protocol, tmp_path, monkeypatch, body) as scene:
+    async with room(protocol, shared, tmp_path, monkeypatch, body) as scene:
         page = await scene.browser.open("/#/robot/r1")
         found = await drawn(page, PUBLISHED[protocol])
         await scene.browser.photograph(page, f"room-{protocol}")

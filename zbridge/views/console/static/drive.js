@@ -155,7 +155,10 @@ export class Drive {
     this.token = control.token;
     this.lostAt = null;
     if (began) this.keepAwake();
-    if (!this.held) this.wakeLock?.release();
+    if (!this.held) {
+      this.inputs.clear(); // a button that is held may vanish with control, and its release with it
+      this.wakeLock?.release();
+    }
     this.send();
     this.changed();
   }

@@ -23,11 +23,8 @@ import pytest
 import pytest_asyncio
 
 from tests.fake_bus import FakeBus
-from tests.ports import HOST
+from tests.views.console.serving import served
 from zbridge.client import Fleet
-from zbridge.protocol.address import Address
-from zbridge.views.console import server
-from zbridge.views.console.roster import Roster
 
 NAMED = os.environ.get("ZBRIDGE_CHROMIUM")
 CHROMIUM = NAMED or shutil.which("chromium")
@@ -88,7 +85,7 @@ class Feed:
 
     def __init__(self, *rows: dict[str, Any], **more: Any) -> None:
         self.asked: list[dict[str, Any]] = []
-        self._begin = {"full": True, "realm": "fleet", "bus": True, "notices": {}, "roster": None, **more}
+        self._begin = {"full": True, "realm": "fleet", "bus": True, "notices": {}, "fault": None, **more}
         self._rows = rows
         self._socket: Any = None
         self.quiet = False
@@ -197,14 +194,9 @@ def _closing(files: list[Any]) -> Iterator[None]:
 @pytest_asyncio.fixture(loop_scope="session")
 async def browser(tmp_path: Any, shared: Any) -> AsyncIterator[Browser]:
     """A browser before a console without robots."""
-    served: asyncio.Future[str] = asyncio.get_running_loop().create_future()
     bus = FakeBus().join("console")
-    with contextlib.closing(server.listener(Address(HOST, 0))) as listening:
-        roster = Roster(tmp_path / "roster")
-        serving = asyncio.create_task(server.serve(Fleet(bus), bus, listening, roster, served.set_result))
-        yield Browser(shared, await served)
-        serving.cancel()
-        await asyncio.gather(serving, return_exceptions=True)
+    async with served(Fleet(bus), bus, tmp_path / "roster") as at:
+        yield Browser(shared, at)
 
 
 def row(name: str, state: str = "established", severity: int = 9, **fields: Any) -> dict[str, Any]:

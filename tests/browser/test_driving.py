@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
 import os
 import signal
@@ -17,12 +16,9 @@ import pytest_asyncio
 
 from tests.browser.conftest import Browser, soon
 from tests.client import Gateway, World
-from tests.ports import HOST
+from tests.views.console.serving import served
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Device, Devices, Drive, Mode, Motor, Status
-from zbridge.protocol.address import Address
-from zbridge.views.console import server
-from zbridge.views.console.roster import Roster
 
 pytestmark = pytest.mark.asyncio(loop_scope="session")
 
@@ -88,19 +84,12 @@ async def publish_status(world: World) -> None:
 async def lane(tmp_path: Path, shared: Any) -> AsyncIterator[Lane]:
     world = World("r1")
     publishing = asyncio.create_task(publish_status(world))
-    served: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-    with contextlib.closing(server.listener(Address(HOST, 0))) as listening:
-        serving = asyncio.create_task(
-            server.serve(
-                world.fleet, world.bus.join("console"), listening, Roster(tmp_path / "roster"), served.set_result
-            )
-        )
-        made = Lane(world, Browser(shared, await served))
+    async with served(world.fleet, world.bus.join("console"), tmp_path / "roster") as at:
+        made = Lane(world, Browser(shared, at))
         yield made
         assert made.browser.complaints == []
-        serving.cancel()
-        publishing.cancel()
-        await asyncio.gather(serving, publishing, return_exceptions=True)
+    publishing.cancel()
+    await asyncio.gather(publishing, return_exceptions=True)
 
 
 async def test_keys_drive_while_they_are_held_and_the_limit_counts(lane: Lane) -> None:

@@ -108,7 +108,7 @@ CLOSED = "--connect tcp/127.0.0.1:1"
 """Nobody listens there."""
 WRONG: list[tuple[str, int, str]] = [
     ("console --listen nonsense", 2, "--listen 'nonsense': expected host:port"),
-    ("console --listen 0.0.0.0:80", 2, "loopback only"),
+    ("console --listen 0.0.0.0:80", 2, "expected --tls-certificate"),
     # what is typed
     ("frobnicate", 2, "No such command 'frobnicate'"),
     ("--frobnicate", 2, "No such option: --frobnicate"),

@@ -13,6 +13,7 @@ from zbridge.app import addressed, listener_template, robot_template, secured, u
 from zbridge.bus.tls.files import folder_tls
 from zbridge.cli import (
     certs,
+    console,
     doctor,
     give_up,
     hand_on_tls,
@@ -42,6 +43,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.add_typer(certs.app, name="certs")
+app.add_typer(console.app, name="console")
 app.add_typer(robot_commands.app)
 app.add_typer(doctor.app)
 app.add_typer(recording_commands.app)

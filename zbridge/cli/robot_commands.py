@@ -1,6 +1,6 @@
 """Declares what is done with robots of the bus.
 
-``zbridge ls, top, console, health, echo, drive, stop, unlatch, restart, foxglove, ros2``.
+``zbridge ls, top, health, echo, drive, stop, unlatch, restart, foxglove, ros2``.
 """
 
 from __future__ import annotations
@@ -59,25 +59,6 @@ def foxglove(
 
     set_up_log(verbose=verbose)
     run_foxglove(bus_settings(connect, tls), realm, file, locals())
-
-
-@app.command()
-def console(
-    listen: Annotated[
-        str, typer.Option(help="host:port for browsers, on loopback; port 0: any free one")
-    ] = "127.0.0.1:8080",
-    roster: Annotated[
-        Path | None, typer.Option(help="file of the known robots; by default in the user's state folder")
-    ] = None,
-    connect: Connect = [],
-    tls: TlsFolder = None,
-    realm: Realm = "fleet",
-) -> None:
-    """Serve the fleet to browsers until SIGTERM or SIGINT: who is there and how, and STOP ALL."""
-    from zbridge.cli.viewers import run_console
-
-    set_up_log(verbose=False)
-    run_console(bus_settings(connect, tls), realm, listen, roster)
 
 
 @app.command()

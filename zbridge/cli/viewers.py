@@ -52,17 +52,28 @@ def run_foxglove(bus: BusSettings, realm: str, file: Path | None, given: dict[st
         run_loop(until_signal(server.serve_file(planned, file, metrics, ready)))
 
 
-def run_console(bus: BusSettings, realm: str, listen: str, roster: Path | None) -> None:
-    """Serve pages until SIGTERM or SIGINT; raise ZbridgeError. roster: its file, None: the usual one."""
+def run_console(bus: BusSettings, realm: str, given: dict[str, Any]) -> None:
+    """Serve pages until SIGTERM or SIGINT; raise ZbridgeError. given: the options of the command, by their names."""
     try:
         from zbridge.views.console import server
+        from zbridge.views.console.http_server import listener
     except ImportError as error:
         raise ConfigError(f"{error}: install the extra: pip install 'zbridge[console]'") from error
     try:
-        at = Address.parse(f"tcp://{listen}")
+        at = Address.parse(f"tcp://{given['listen']}")
     except LinkError as error:
-        raise ConfigError(f"--listen {listen!r}: expected host:port") from error
-    known = Roster(roster or state_folder() / f"{realm}.roster")
+        raise ConfigError(f"--listen {given['listen']!r}: expected host:port") from error
+    settings = server.ConsoleSettings(
+        listen=at,
+        hosts=tuple(given["host"]),
+        certificate=given["tls_certificate"],
+        key=given["tls_key"],
+        users=given["users"],
+        journal=given["journal"] or (state_folder() / f"{realm}.console.jsonl" if given["users"] is not None else None),
+        proxied=given["proxied"],
+        own_role=own_role(bus.tls),
+    )
+    known = Roster(given["roster"] or state_folder() / f"{realm}.roster")
     known.load()
     gc.freeze()  # objects made at start-up live as long as the process; the collector skips them
 
@@ -70,9 +81,10 @@ def run_console(bus: BusSettings, realm: str, listen: str, roster: Path | None) 
         print(f"console at {address}", flush=True)  # noqa: T201
 
     async def work() -> None:
-        with contextlib.closing(server.listener(at)) as listening:
+        with contextlib.closing(listener(at)) as listening:
             async with joined(bus, realm) as session:
-                await server.serve(Fleet(session, realm, own_name(bus.tls)), session, listening, known, ready)
+                fleet = Fleet(session, realm, own_name(bus.tls))
+                await server.serve(fleet, session, settings, listening, known, ready)
 
     run_loop(until_signal(work()))
 

@@ -1,4 +1,4 @@
-"""A token bucket: so many times a second, a second's worth at once. Sans-IO."""
+"""A token bucket: so many times a second, a second's worth at once, or as many as its burst. Sans-IO."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from zbridge.protocol.kept import Kept
 
 
 class RateLimit(Kept):
-    """A bucket of ``rate_hz`` tokens that fills in a second; ``inf``: never empty."""
+    """A bucket of ``burst`` tokens that gets ``rate_hz`` a second; ``inf``: never empty. burst: default ``rate_hz``."""
 
     kept: ClassVar[dict[str, Any]] = {"left": float, "_filled_at": float}
 
-    def __init__(self, rate_hz: float) -> None:
+    def __init__(self, rate_hz: float, burst: float | None = None) -> None:
         self.rate_hz = rate_hz
-        self.left = rate_hz
+        self.burst = rate_hz if burst is None else burst
+        self.left = self.burst
         """Tokens as of the last :meth:`fill`."""
         self._filled_at = 0.0
 
@@ -23,8 +24,8 @@ class RateLimit(Kept):
 
     def fill(self, now: float) -> float:
         """Add the tokens of the time since the last call; give those there are."""
-        if self.left < self.rate_hz:
-            self.left = min(self.rate_hz, self.left + (now - self._filled_at) * self.rate_hz)
+        if self.left < self.burst:
+            self.left = min(self.burst, self.left + (now - self._filled_at) * self.rate_hz)
         self._filled_at = now
         return self.left
 

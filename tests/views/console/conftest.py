@@ -13,9 +13,7 @@ import pytest
 from websockets.asyncio.client import ClientConnection, connect
 
 from tests.client import World
-from tests.ports import HOST
-from zbridge.protocol.address import Address
-from zbridge.views.console import server
+from tests.views.console.serving import served
 from zbridge.views.console.roster import Roster
 
 
@@ -48,13 +46,5 @@ class Scene:
 @pytest.fixture
 async def scene(tmp_path: Path) -> AsyncIterator[Scene]:
     world, roster = World("r1", "r2"), Roster(tmp_path / "fleet.roster")
-    served: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-    with contextlib.closing(server.listener(Address(HOST, 0))) as listening:
-        serving = asyncio.create_task(
-            server.serve(world.fleet, world.bus.join("console"), listening, roster, served.set_result)
-        )
-        try:
-            yield Scene(world, await served, roster)
-        finally:
-            serving.cancel()
-            await asyncio.gather(serving, return_exceptions=True)
+    async with served(world.fleet, world.bus.join("console"), roster) as at:
+        yield Scene(world, at, roster)

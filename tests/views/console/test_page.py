@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from zbridge.views.console import page as page_module
-from zbridge.views.console.page import Page
+from zbridge.views.console.page import FleetFollower, Page
 
 
 class SlowSocket:
@@ -38,7 +38,9 @@ class SlowSocket:
 @contextlib.asynccontextmanager
 async def served() -> AsyncIterator[tuple[SlowSocket, Page]]:
     socket: Any = SlowSocket()
-    page = Page(socket, lambda: b"all", lambda page, request: None)
+    follower = FleetFollower(lambda: b"all")
+    page = Page(socket, follower, lambda request: None)
+    page.tell = follower.tell  # type: ignore[attr-defined]
     serving = asyncio.create_task(page.serve())
     try:
         await asyncio.sleep(0)

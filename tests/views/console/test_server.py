@@ -22,7 +22,8 @@ from zbridge.errors import ConfigError, LinkError
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Status
 from zbridge.protocol.address import Address
-from zbridge.views.console import console, page, server
+from zbridge.views.console import console, orders, page, server
+from zbridge.views.console.http_server import listener
 
 CONFIRMED = "stopped (their gateways sent it)"
 
@@ -76,7 +77,7 @@ async def test_a_robot_that_was_released_and_driven_is_stopped_by_the_next_press
     async with scene.page() as opened:
         await opened.send(json.dumps({"do": "stop_all"}))
         await latched(robot)
-        await asyncio.sleep(console.SAME_PRESS_S)
+        await asyncio.sleep(orders.SAME_PRESS_S)
         await scene.world.fleet.unlatch()
         async with scene.world.others.control("ann") as drive:
             await drive(forward=0.5)
@@ -104,7 +105,7 @@ async def test_a_release_names_who_is_latched_by_a_stop_of_its_own(scene: Scene)
         done = await until(opened, lambda message: notice(message, "all").get("good") is not None)
     said = done["notices"]["all"]
     assert not said["good"]
-    assert said["text"].endswith("still latched by a stop of its own, which zbridge unlatch ends: r2")
+    assert said["text"].endswith("still latched by a stop of its own, released on the robot's page: r2")
 
 
 async def test_one_robot_is_stopped_and_the_other_one_is_not(scene: Scene) -> None:
@@ -244,7 +245,7 @@ async def test_a_page_that_sends_what_it_must_not_is_closed_and_others_stay(scen
 
 
 async def test_there_are_no_more_pages_than_fit(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(console, "PAGES", 1)
+    monkeypatch.setattr(console, "FOLLOWERS", 1)
     async with scene.page() as first:
         await until(first, lambda message: message.get("full"))
         with pytest.raises(InvalidStatus):
@@ -259,13 +260,55 @@ async def test_there_are_no_more_pages_than_fit(scene: Scene, monkeypatch: pytes
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.168.0.2", "::", "example.org"])
-def test_it_listens_on_loopback_only(host: str) -> None:
-    with pytest.raises(ConfigError, match="loopback only"):
-        server.listener(Address(host, 0))
+def test_off_loopback_it_needs_tls_and_users(host: str) -> None:
+    with pytest.raises(ConfigError, match="expected --tls-certificate"):
+        server.ConsoleSettings(Address(host, 8080))
+    files = {"certificate": Path("c.pem"), "key": Path("k.pem"), "hosts": ("console.lab",)}
+    with pytest.raises(ConfigError, match="expected --users"):
+        server.ConsoleSettings(Address(host, 8080), **files)  # type: ignore[arg-type]
+    server.ConsoleSettings(Address(host, 8080), users=Path("users.toml"), **files)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("settings", "text"),
+    [
+        ({"own_role": "operator"}, "every user of this machine could use the console's certificate"),
+        ({"hosts": ("console.lab",)}, "expected --users"),
+        ({"certificate": Path("c.pem")}, "expected both, or neither"),
+        ({"proxied": True}, "--proxied: expected an address of loopback, and --host"),
+    ],
+)
+def test_settings_that_let_somebody_in_by_mistake_are_errors(settings: dict[str, Any], text: str) -> None:
+    with pytest.raises(ConfigError, match=text):
+        server.ConsoleSettings(Address(HOST, 8080), **settings)
+
+
+@pytest.mark.parametrize(
+    ("settings", "port", "origins"),
+    [
+        ({}, 8080, ["http://127.0.0.1:8080", "http://localhost:8080"]),
+        (
+            {"hosts": ("console.lab",), "users": Path("u")},
+            8080,
+            ["http://console.lab:8080", "http://127.0.0.1:8080", "http://localhost:8080"],
+        ),
+        ({"hosts": ("console.lab",), "users": Path("u"), "proxied": True}, 8080, ["https://console.lab"]),
+        (
+            {"certificate": Path("c"), "key": Path("k")},
+            443,
+            [
+                *("https://127.0.0.1:443", "https://localhost:443"),
+                *("https://127.0.0.1", "https://localhost"),
+            ],
+        ),
+    ],
+)
+def test_the_origins_of_its_own_pages(settings: dict[str, Any], port: int, origins: list[str]) -> None:
+    assert server.ConsoleSettings(Address(HOST, port), **settings).origins(HOST, port) == origins
 
 
 def test_a_port_that_is_taken_is_an_error_that_names_it() -> None:
     with socket.create_server((HOST, 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(LinkError, match=str(port)):
-            server.listener(Address(HOST, port))
+            listener(Address(HOST, port))

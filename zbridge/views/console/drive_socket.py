@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -15,9 +14,9 @@ from zbridge.metrics import Metrics
 from zbridge.protocol.rate_limit import RateLimit
 from zbridge.tasks import race
 from zbridge.views.console.drive_link import TICK_S, DriveLink, Due, PageCommand
+from zbridge.views.console.journal import Journal
+from zbridge.views.console.rights import Action, Caller
 from zbridge.views.console.seats import Seat, Seats
-
-log = logging.getLogger("zbridge.console")
 
 MESSAGES_HZ = 200.0
 """Most messages a second; a page that sends more is closed."""
@@ -53,11 +52,16 @@ _decode = msgspec.json.Decoder(PageCommand | TakeControl | GiveControl | ResumeC
 class DriveSocket:
     """One page that drives, or wants to. metrics: count what is dropped, and why."""
 
-    def __init__(self, socket: WebSocket, seat: Seat, seats: Seats, metrics: Metrics) -> None:
+    def __init__(
+        self, socket: WebSocket, seat: Seat, seats: Seats, caller: Caller, journal: Journal, metrics: Metrics
+    ) -> None:
         self._socket = socket
         self._seat = seat
         self._seats = seats
         self._metrics = metrics
+        self._caller = caller
+        self._journal = journal
+        self._held = False
         self._loop = asyncio.get_running_loop()
         self._link = DriveLink(self._loop.time())
         self._rate = RateLimit(MESSAGES_HZ)
@@ -89,6 +93,9 @@ class DriveSocket:
             self._link.sent(moving=False)
         elif self._seat.held and self._seat.token is None:
             self._seats.issue(self._seat)
+        if self._seat.held is not self._held:
+            self._held = self._seat.held
+            self._note("drive", "has control" if self._held else self._seat.notice or "gave control back")
         self._changed.set()
 
     # What the page sends
@@ -115,7 +122,7 @@ class DriveSocket:
             case PageCommand():
                 self._drive(message, now)
             case TakeControl():
-                self._seat.take(takeover=message.takeover)
+                self._take_control(takeover=message.takeover)
             case GiveControl():
                 self._halt("control was given back")
                 self._seat.give()
@@ -123,6 +130,15 @@ class DriveSocket:
                 self._resume(message.token)
             case SetMode():
                 self._seat.set_mode(message.mode)
+
+    def _take_control(self, *, takeover: bool) -> None:
+        if takeover and not self._caller.may(Action.TAKE_OVER):
+            self._note("take_over", "refused: no right")
+            self._seat.notice = self._caller.refusal(Action.TAKE_OVER)
+            self._changed.set()
+            return
+        self._note("take_over" if takeover else "take", "asked")
+        self._seat.take(takeover=takeover)
 
     def _drive(self, command: PageCommand, now: float) -> None:
         if not self._seat.active:
@@ -162,6 +178,9 @@ class DriveSocket:
         self._seats.leave(self._seat)
         self._sit(seat)
         seat.halt("the page was reloaded", moving=False)
+
+    def _note(self, action: str, result: str) -> None:
+        self._journal.note(self._caller, action, self._seat.robot, result)
 
     def _count(self, why: str) -> None:
         self._metrics.count("console_commands_dropped", reason=why).value += 1

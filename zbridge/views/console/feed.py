@@ -29,6 +29,29 @@ class FleetFeed:
     def __repr__(self) -> str:
         return f"<FleetFeed {len(self.rows)} rows>"
 
+    def alive(self) -> list[str]:
+        """Return the robots that have a gateway now."""
+        return [name for name, entry in self._model.robots.items() if entry.alive]
+
+    def is_alive(self, robot: str) -> bool:
+        """Return whether a robot has a gateway now."""
+        entry = self._model.robots.get(robot)
+        return entry is not None and entry.alive
+
+    def accepts(self, robot: str) -> tuple[str, ...]:
+        """Return the commands that a robot accepts now."""
+        entry = self._model.robots.get(robot)
+        return entry.status.commands if entry is not None and entry.status is not None else ()
+
+    def latched(self) -> list[str]:
+        """Return the robots that are latched now."""
+        self._model.take()
+        return [name for name, entry in self._model.robots.items() if entry.stopped_by]
+
+    def forget(self, robot: str) -> None:
+        """Forget a robot, until it is on the bus again."""
+        self._model.robots.pop(robot, None)
+
     def refresh(self, roster: Iterable[str], *, connected: bool) -> bytes | None:
         """Read the model; return what has changed since the last call as JSON, None if nothing has."""
         self._model.take()

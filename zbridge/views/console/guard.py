@@ -29,11 +29,12 @@ _REFUSED = 1008
 
 
 class Guard:
-    """Lets through what comes from our own pages. hosts: ``host:port`` as browsers write it."""
+    """Lets through what comes from our own pages, and from programs. origins: of our pages, ``scheme://host:port``."""
 
-    def __init__(self, app: ASGIApp, hosts: frozenset[str]) -> None:
+    def __init__(self, app: ASGIApp, origins: frozenset[str]) -> None:
         self._app = app
-        self._hosts = hosts
+        self._origins = origins
+        self._hosts = frozenset(origin.partition("://")[2] for origin in origins)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if (why := self._refused(scope)) is None:
@@ -49,17 +50,24 @@ class Guard:
         headers = Headers(scope=scope)
         if headers.get("host", "") not in self._hosts:
             return f"expected Host: {' or '.join(sorted(self._hosts))}"
-        asks = scope["type"] == "http" and scope["method"] in ("GET", "HEAD")
-        if not asks and headers.get("origin", "").removeprefix("http://") not in self._hosts:
-            return "expected the Origin of this console's own pages"
-        return None
+        if scope["type"] == "http" and scope["method"] in ("GET", "HEAD"):
+            return None
+        if headers.get("origin") in self._origins or (scope["type"] == "http" and _is_program(headers)):
+            return None
+        return "expected the Origin of this console's own pages"
+
+
+def _is_program(headers: Headers) -> bool:
+    """Return whether no browser sent a request: they name the page that makes them send one."""
+    return not any(name in headers for name in ("origin", "cookie", "sec-fetch-site"))
 
 
 def _with_headers(send: Send) -> Send:
     async def sending(message: Message) -> None:
         if message["type"] == "http.response.start":
             headers: Any = MutableHeaders(scope=message)
-            headers.update(ANSWERED)
+            for name, value in ANSWERED.items():
+                headers.setdefault(name, value)
         await send(message)
 
     return sending

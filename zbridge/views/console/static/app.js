@@ -3,9 +3,13 @@
 import { html, render } from "./vendor/htm-preact.js";
 import { Fleet } from "./fleet.js";
 import { Header } from "./header.js";
+import { Login, whoAmI } from "./login.js";
 import { Store } from "./store.js";
 
+const AGAIN_MS = 1000;
+
 let scheduled = false;
+let store = null;
 let Robot = null; // loaded with the first page of a robot: the fleet is painted sooner
 
 async function loadRobot() {
@@ -18,6 +22,7 @@ function draw() {
   scheduled = true;
   requestAnimationFrame(() => {
     scheduled = false;
+    if (!store) return;
     const name = location.hash.startsWith("#/robot/") ? decodeURIComponent(location.hash.slice(8)) : null;
     document.title = `${name ?? store.realm ?? "fleet"} - zbridge console`;
     if (name !== null && !Robot) loadRobot();
@@ -26,18 +31,35 @@ function draw() {
   });
 }
 
-const store = new Store(draw);
+function begin(me) {
+  store = new Store(draw, me, start);
+  draw();
+}
+
+// Asks who this page acts for, at the beginning and whenever its login may have ended.
+async function start() {
+  store?.close();
+  store = null;
+  try {
+    const me = await whoAmI();
+    if (me) begin(me);
+    else render(html`<${Login} done=${begin} />`, document.body);
+  } catch {
+    setTimeout(start, AGAIN_MS);
+  }
+}
+
 addEventListener("hashchange", draw);
 addEventListener("resize", draw);
 // Escape stops wherever the page receives it: before any control does.
 addEventListener(
   "keydown",
   (event) => {
-    if (event.key === "Escape" && !event.repeat) {
+    if (event.key === "Escape" && !event.repeat && store) {
       event.preventDefault();
       store.stopAll();
     }
   },
   { capture: true },
 );
-draw();
+start();

@@ -122,7 +122,7 @@ export class Drive {
 
   connect() {
     if (this.socket) return;
-    const socket = (this.socket = new WebSocket(`ws://${location.host}/drive/${this.robot}`));
+    const socket = (this.socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/drive/${this.robot}`));
     this.tick = { number: 0, at: -Infinity };
     this.sentAt.clear();
     this.waiting = [];

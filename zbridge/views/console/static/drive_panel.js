@@ -15,7 +15,7 @@ export function DrivePanel({ drive, row, data }) {
   }, [drive]);
   const drivable = row.commands.includes("drive") || row.commands.includes("motor");
   const { state, notice } = drive.control;
-  if (!drivable && state === "none") return null; // while it is driven the panel stays, whatever its gateway says
+  if (!drive.store.may("drive") || (!drivable && state === "none")) return null; // while it is driven the panel stays, whatever its gateway says
   return html`<section class="panel drive" aria-label="Drive">
     <${Control} drive=${drive} row=${row} />
     ${notice && html`<p class="age" role="status">${notice}</p>`}
@@ -38,6 +38,10 @@ function Control({ drive, row }) {
       <button type="button" onClick=${press(() => drive.give())}>Give back</button></div>`;
   }
   if (state === "asking") return html`<p>Asking the gateway of ${row.name} for control.</p>`;
+  if (asked && !drive.store.may("take_over")) {
+    return html`<p class="question">${other} drives ${row.name}. Taking over needs the role supervisor.
+      <button type="button" onClick=${press(() => ask(false))}>Close</button></p>`;
+  }
   if (asked) {
     return html`<p class="question">${other} drives ${row.name}, and loses control.
       <button type="button" class="sure" onClick=${press(() => drive.take(true))}>Take over</button>

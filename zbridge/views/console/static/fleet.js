@@ -121,7 +121,7 @@ function Row({ row, store, place, top }) {
     <span role="cell" class="rate">${row.rate === null ? "" : row.rate.toFixed(1)}</span>
     <span role="cell" class="refused">${number(row.refused)}</span>
     <span role="cell" class="act">
-      ${missing && html`<button type="button" aria-label=${`Forget ${row.name}`} onClick=${forget}>Forget</button>`}
+      ${missing && store.may("forget") && html`<button type="button" aria-label=${`Forget ${row.name}`} onClick=${forget}>Forget</button>`}
       ${!missing && html`<button type="button" class="stop" aria-label=${`Stop ${row.name}`} onClick=${stop}>Stop</button>`}
     </span>
   </div>`;

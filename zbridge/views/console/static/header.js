@@ -1,6 +1,7 @@
 // What is on every page: where we are, STOP ALL, Release, and what came of the last stop.
 
 import { html, useState } from "./vendor/htm-preact.js";
+import { logOut } from "./login.js";
 
 export function leave(event) {
   event.currentTarget.blur(); // the space bar would click it again
@@ -12,7 +13,9 @@ export function Header({ store }) {
   return html`<header>
     <div class="bar">
       <a class="home" href="#">zbridge <span class="realm">${store.realm}</span></a>
-      ${latched > 0 && html`<${Release} store=${store} latched=${latched} />`}
+      ${store.me.user && html`<span class="empty">${store.me.user} (${store.me.role})
+        <button type="button" onClick=${() => logOut(store.me)}>Log out</button></span>`}
+      ${latched > 0 && store.may("unlatch_fleet") && html`<${Release} store=${store} latched=${latched} />`}
       <button
         class="stop-all"
         type="button"
@@ -28,7 +31,8 @@ export function Header({ store }) {
     <div class="notices" role="status" aria-live="assertive">
       ${(!store.connected || store.silent) && html`<p class="notice bad">The console does not answer: what is shown is old.</p>`}
       ${store.connected && !store.bus && html`<p class="notice bad">The bus is lost: nothing is known of the robots.</p>`}
-      ${store.roster && html`<p class="notice bad">The list of known robots is not saved: ${store.roster}</p>`}
+      ${store.fault && html`<p class="notice bad">The console's own files: ${store.fault}</p>`}
+      ${store.warning && html`<${Notice} notice=${store.warning} />`}
       ${["all", "one"].map((of) => store.notices[of] && html`<${Notice} key=${of} notice=${store.notices[of]} />`)}
     </div>
   </header>`;

@@ -26,7 +26,10 @@ const KEYS = {
   image: fields({ format: isText, data: isBin }),
   text: fields({ text: isText, kind: optional(isText), sender: optional(isText) }),
   status: fields({ links: optional(isList(fields({ name: isText, state: isText, peer: isText }))) }),
-  control: fields({ refusals: optional(isList(fields({ command: isText, reason: isText, count: isNumber }))) }),
+  control: fields({
+    refusals: optional(isList(fields({ command: isText, reason: isText, count: isNumber }))),
+    latches: optional(isList(isMap)),
+  }),
   lidar: fields({ on: isFlag }),
   camera: fields({ on: isFlag }),
   devices: fields({ devices: isList(fields({ name: isText, kind: isText })) }),

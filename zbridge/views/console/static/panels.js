@@ -44,7 +44,7 @@ export function Facts({ row, data }) {
 
 export function Switches({ row, data, store }) {
   const accepted = SWITCHES.filter((name) => row.commands.includes(name));
-  if (!accepted.length) return null;
+  if (!accepted.length || !store.may("switch")) return null;
   const set = (name, on) => (event) => {
     leave(event);
     store.send({ do: "switch", robot: row.name, name, on });

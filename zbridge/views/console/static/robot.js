@@ -27,7 +27,7 @@ export function Robot({ store, name }) {
   }
   data.away = !PRESENT.includes(row.state) || !store.connected || !store.bus;
   return html`<section class="robot ${tone(row)}">
-    <${Title} row=${row} store=${store} />
+    <${Title} row=${row} store=${store} own=${(data.message("control")?.latches ?? []).some((latch) => !latch.fleet)} />
     <div class="columns">
       <div class="views">
         <${Picture} data=${data} />
@@ -82,10 +82,15 @@ function useDrive(store, name) {
   return drive?.robot === name ? drive : null;
 }
 
-function Title({ row, store }) {
+// own: whether a latched stop of this robot alone is in force.
+function Title({ row, store, own }) {
   const stop = (event) => {
     leave(event);
     store.send({ do: "stop", robot: row.name });
+  };
+  const unlatch = (event) => {
+    leave(event);
+    store.send({ do: "unlatch", robot: row.name });
   };
   const why = [row.seen !== null ? `last seen ${since(row.seen)}` : "", row.reason].filter(Boolean).join("; ");
   return html`<div class="title">
@@ -93,6 +98,7 @@ function Title({ row, store }) {
     <h1>${row.name}</h1>
     <span class="state"><b>${row.state}</b></span>
     <span class="driver">${driverText(row)}</span>
+    ${own && store.may("unlatch") && html`<button type="button" onClick=${unlatch}>Release ${row.name}</button>`}
     <button type="button" class="stop" aria-label=${`Stop ${row.name}`} onClick=${stop}>Stop</button>
     ${why && html`<p class="why">${why}</p>`}
   </div>`;

@@ -1,8 +1,10 @@
 // What the page knows: the rows of all robots, the last notices, the robot that it looks at, and whether anybody answers.
 
+import { whoAmI } from "./login.js";
 import { RobotData } from "./robot_data.js";
 
 const AGAIN_MS = [250, 500, 1000, 2000];
+const REFUSED = 1008; // the code by which the console ends a page whose login has ended
 const KEPT = 60; // rates of a robot that its sparkline shows
 const STALE_STOP_MS = 10000;
 const SILENT_MS = 6000; // the console says something every 2 s
@@ -10,14 +12,18 @@ const UNANSWERED_MS = 1500; // it says at once that it sends STOP ALL
 const ROBOTS = 8; // robots whose trail and plots are kept while another one is looked at
 
 export class Store {
-  constructor(changed) {
+  // changed: called when anything has changed. me: whom the page acts for. refused: called when the console refuses it.
+  constructor(changed, me, refused) {
+    this.me = me;
+    this.refused = refused;
     this.rows = new Map();
     this.rates = new Map();
     this.notices = {};
     this.realm = "";
     this.bus = true;
     this.connected = false;
-    this.roster = null;
+    this.fault = null;
+    this.warning = null; // why what this page asked for was not done
     this.changed = changed;
     this.tries = 0;
     this.known = false; // whether the robots have been told
@@ -27,7 +33,17 @@ export class Store {
     this.looked = "";
     this.robots = new Map(); // by name, the one that was looked at last at the end
     this.connect();
-    setInterval(() => this.sample(), 1000);
+    this.timer = setInterval(() => this.sample(), 1000);
+  }
+
+  close() {
+    clearInterval(this.timer);
+    this.closed = true;
+    this.socket.close();
+  }
+
+  may(action) {
+    return this.me.may.includes(action);
   }
 
   get silent() {
@@ -51,7 +67,7 @@ export class Store {
   }
 
   connect() {
-    const socket = (this.socket = new WebSocket(`ws://${location.host}/socket`));
+    const socket = (this.socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/socket`));
     socket.onopen = () => {
       this.tries = 0;
       this.connected = true;
@@ -66,23 +82,34 @@ export class Store {
       if (typeof event.data === "string") this.take(JSON.parse(event.data));
       else this.robots.get(this.looked)?.take(new Uint8Array(event.data));
     };
-    socket.onclose = () => {
+    socket.onclose = (event) => {
+      if (this.closed) return;
+      if (event.code === REFUSED) return void this.refused();
+      if (this.tries > 0) this.checkLogin();
       this.connected = false;
       this.changed();
       setTimeout(() => this.connect(), AGAIN_MS[Math.min(this.tries++, AGAIN_MS.length - 1)]);
     };
   }
 
+  // A socket that never opens does not say why: the login may have ended.
+  async checkLogin() {
+    const me = await whoAmI().catch(() => this.me);
+    if (!me && !this.closed) this.refused();
+  }
+
   take(message) {
     if (message.full) this.rows.clear();
     this.known = this.known || Boolean(message.full);
     if (message.notices?.all) this.clearUnanswered();
+    if (message.me) this.me = { ...this.me, ...message.me };
+    if (message.warning) this.warning = { text: message.warning, at: Date.now() / 1000, good: false };
     for (const row of message.rows ?? []) this.rows.set(row.name, row);
     for (const name of message.gone ?? []) {
       this.rows.delete(name);
       this.rates.delete(name);
     }
-    for (const name of ["realm", "bus", "notices", "roster"]) if (name in message) this[name] = message[name];
+    for (const name of ["realm", "bus", "notices", "fault"]) if (name in message) this[name] = message[name];
     this.changed();
   }
 
@@ -97,6 +124,7 @@ export class Store {
   }
 
   send(request) {
+    this.warning = null;
     if (this.socket.readyState === WebSocket.OPEN) {
       this.socket.send(JSON.stringify(request));
       return true;

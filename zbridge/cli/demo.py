@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import itertools
 import math
+import secrets
 import sys
 import tempfile
 import webbrowser
@@ -134,8 +135,9 @@ async def run_demo(seconds: float, *, secure: bool = False, console: bool = Fals
             *(f"  {name}: {_how_to_connect(find_protocol(robots[name]), listeners[name])}" for name in watch.rows),
         ]
         if _has_console():
-            at = await stack.enter_async_context(_console(folder, log, bus.joins, opens=console))
-            how.append(f"the fleet in a browser, with STOP ALL: {at}")
+            options, login = _console_users(folder) if secure else ((), "")
+            serving = _console(folder, log, (*bus.joins, *options), opens=console)
+            how.append(f"the fleet in a browser, with STOP ALL: {await stack.enter_async_context(serving)}{login}")
         await until_signal(_show(bus.operator, watch, seconds, how))
         await end([gateway for _, gateway in processes])  # all at once: each needs about a second to stop its robot
         await end([simulator for simulator, _ in processes])
@@ -154,14 +156,23 @@ def _has_console() -> bool:
     return all(find_spec(module) is not None for module in ("starlette", "uvicorn", "websockets"))
 
 
+def _console_users(folder: Path) -> tuple[tuple[str, ...], str]:
+    """Make a user of the console; return the options that name the file, and how to log in."""
+    from zbridge.views.console.users import User, hash_password, save_users
+
+    file, password = folder / "users.toml", secrets.token_urlsafe(9)
+    save_users(file, {"demo": User("supervisor", hash_password(password))})
+    return ("--users", str(file), "--journal", str(folder / "journal")), f" (user demo, password {password})"
+
+
 @contextlib.asynccontextmanager
-async def _console(folder: Path, log: IO[bytes], joins: tuple[str, ...], *, opens: bool) -> AsyncIterator[str]:
+async def _console(folder: Path, log: IO[bytes], more: tuple[str, ...], *, opens: bool) -> AsyncIterator[str]:
     """Run the console while the context lasts; yield its address, or why it has none.
 
-    joins: the options by which it joins the bus. opens: whether to open it in a browser.
+    more: the options by which it joins the bus, and others. opens: whether to open it in a browser.
     """
     options = ("--listen", "127.0.0.1:0", "--roster", str(folder / "roster"))
-    async with process(log, "console", *options, *joins, read=True) as console:
+    async with process(log, "console", *options, *more, read=True) as console:
         assert console.stdout is not None
         line = b""
         with contextlib.suppress(TimeoutError):

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from tests.client import World
+from tests.views.console.programs import PASSWORD, Programs
 from tests.views.console.serving import served
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Map, Pose, Status
@@ -26,71 +26,30 @@ from zbridge.views.console.callers import COOKIE
 from zbridge.views.console.users import User, hash_password, new_token, save_users
 
 CONFIRMED = "stopped (their gateways sent it)"
-PASSWORD = "correct horse"
 HASHED = hash_password(PASSWORD)
 
 
-class Answer:
-    def __init__(self, status: int, headers: dict[str, str], body: bytes) -> None:
-        self.status, self.headers, self.body = status, headers, body
-
-    @property
-    def json(self) -> Any:
-        return json.loads(self.body)
-
-
-class Programs:
-    """Programs and browsers before a console, and its users."""
+class Lab(Programs):
+    """Programs and browsers before a console, and its robots."""
 
     def __init__(self, world: World, at: str, folder: Path, tokens: dict[str, str]) -> None:
-        self.world, self.at, self.host, self.folder, self.tokens = world, at, at.partition("://")[2], folder, tokens
-
-    async def ask(self, method: str, path: str, body: Any = None, user: str | None = None, **headers: str) -> Answer:
-        """Send one request over a connection of its own, with the token of a user."""
-        if user is not None:
-            headers["Authorization"] = f"Bearer {self.tokens[user]}"
-
-        def exchange() -> Answer:
-            connection = http.client.HTTPConnection(self.host, timeout=10)
-            with contextlib.closing(connection):
-                content = body if isinstance(body, bytes) else json.dumps(body).encode() if body is not None else None
-                connection.request(method, path, content, {"Host": self.host, **headers})
-                answer = connection.getresponse()
-                return Answer(answer.status, {k.lower(): v for k, v in answer.getheaders()}, answer.read())
-
-        return await asyncio.to_thread(exchange)
-
-    async def log_in(self, user: str, password: str = PASSWORD, **headers: str) -> Answer:
-        body = {"user": user, "password": password}
-        return await self.ask("POST", "/api/login", body, Origin=self.at, **headers)
-
-    async def browser(self, user: str) -> dict[str, str]:
-        """Log a browser in; give the headers of its requests."""
-        answer = await self.log_in(user)
-        assert answer.status == 200, answer.body
-        cookie = answer.headers["set-cookie"].partition(";")[0]
-        return {"Cookie": cookie, "Origin": self.at, "X-Zbridge-Csrf": answer.json["csrf"]}
+        super().__init__(at, tokens)
+        self.world, self.folder = world, folder
 
     def journal(self) -> list[dict[str, Any]]:
         return [json.loads(line) for line in (self.folder / "journal").read_text().splitlines()]
 
-    @contextlib.asynccontextmanager
-    async def page(self, path: str = "/socket", **headers: str) -> AsyncIterator[Any]:
-        options: dict[str, Any] = {"origin": self.at, "proxy": None, "additional_headers": headers}
-        async with connect(f"ws://{self.host}{path}", **options) as opened:
-            yield opened
-
 
 @pytest.fixture
-async def open_console(tmp_path: Path) -> AsyncIterator[Programs]:
+async def open_console(tmp_path: Path) -> AsyncIterator[Lab]:
     """A console without users."""
     world = World("r1", "r2")
     async with served(world.fleet, world.bus.join("console"), tmp_path / "roster") as at:
-        yield Programs(world, at, tmp_path, {})
+        yield Lab(world, at, tmp_path, {})
 
 
 @pytest.fixture
-async def programs(tmp_path: Path) -> AsyncIterator[Programs]:
+async def programs(tmp_path: Path) -> AsyncIterator[Lab]:
     """A console with a user of each role, who also has a token."""
     world, tokens, known = World("r1", "r2"), dict[str, str](), dict[str, User]()
     for role in ("viewer", "operator", "supervisor"):
@@ -99,7 +58,7 @@ async def programs(tmp_path: Path) -> AsyncIterator[Programs]:
     save_users(tmp_path / "users.toml", known)
     settings = {"users": tmp_path / "users.toml", "journal": tmp_path / "journal"}
     async with served(world.fleet, world.bus.join("console"), tmp_path / "roster", **settings) as at:
-        yield Programs(world, at, tmp_path, tokens)
+        yield Lab(world, at, tmp_path, tokens)
 
 
 async def ended(page: Any) -> tuple[int, str]:
@@ -114,7 +73,7 @@ async def ended(page: Any) -> tuple[int, str]:
 # What it answers
 
 
-async def test_robots_and_what_they_publish_are_read(open_console: Programs) -> None:
+async def test_robots_and_what_they_publish_are_read(open_console: Lab) -> None:
     world = open_console.world
     world.gateway.publish(topics.STATUS, Status("established", protocol="tcpudp", commands=("stop", "drive")))
     world.gateway.publish(topics.MAP, Map(1, 2, 0.5, (0.0, 1.0), np.array([[0, 2]], np.uint8)))
@@ -133,13 +92,13 @@ async def test_robots_and_what_they_publish_are_read(open_console: Programs) -> 
 
 
 @pytest.mark.parametrize("path", ["/api/robots/r9", "/api/robots/r9/status", "/api/robots/r1/scan", "/api/robots/r%2A"])
-async def test_what_is_not_there_is_404_with_a_reason(open_console: Programs, path: str) -> None:
+async def test_what_is_not_there_is_404_with_a_reason(open_console: Lab, path: str) -> None:
     answer = await open_console.ask("GET", path)
     assert answer.status == 404
     assert answer.json["error"]
 
 
-async def test_a_program_stops_and_releases(open_console: Programs) -> None:
+async def test_a_program_stops_and_releases(open_console: Lab) -> None:
     one = await open_console.ask("POST", "/api/robots/r1/stop")
     assert (one.status, one.json) == (200, {"text": "r1 stopped (its gateway sent it)", "good": True})
     everything = await open_console.ask("POST", "/api/stop")
@@ -152,7 +111,7 @@ async def test_a_program_stops_and_releases(open_console: Programs) -> None:
     assert answer.json == {"text": "r2: 1 latched stops released", "good": True}
 
 
-async def test_events_begin_with_all_and_go_on_with_changes(open_console: Programs) -> None:
+async def test_events_begin_with_all_and_go_on_with_changes(open_console: Lab) -> None:
     host, _, port = open_console.host.partition(":")
     reader, writer = await asyncio.open_connection(host, int(port))
     writer.write(f"GET /api/events HTTP/1.1\r\nHost: {open_console.host}\r\n\r\n".encode())
@@ -173,7 +132,7 @@ async def test_events_begin_with_all_and_go_on_with_changes(open_console: Progra
     writer.close()
 
 
-async def test_the_document_names_every_route_and_no_other(open_console: Programs) -> None:
+async def test_the_document_names_every_route_and_no_other(open_console: Lab) -> None:
     document = (await open_console.ask("GET", "/api/openapi.json")).json
     described = {(path, method) for path, methods in document["paths"].items() for method in methods}
     assert described == {(each.path, each.method.lower()) for each in OPERATIONS}
@@ -193,7 +152,7 @@ async def test_the_document_names_every_route_and_no_other(open_console: Program
 # Whom it refuses
 
 
-async def test_without_a_login_nothing_is_told_and_nothing_done(programs: Programs) -> None:
+async def test_without_a_login_nothing_is_told_and_nothing_done(programs: Lab) -> None:
     for each in OPERATIONS:
         if each.right is not None:
             answer = await programs.ask(each.method, each.path.format(robot="r1"))
@@ -208,7 +167,7 @@ async def test_without_a_login_nothing_is_told_and_nothing_done(programs: Progra
     assert not any(gateway.machine.stops for gateway in programs.world.gateways.values())
 
 
-async def test_a_browser_logs_in_and_out_and_an_old_cookie_is_worth_nothing(programs: Programs) -> None:
+async def test_a_browser_logs_in_and_out_and_an_old_cookie_is_worth_nothing(programs: Lab) -> None:
     answer = await programs.log_in("operator")
     cookie = answer.headers["set-cookie"]
     name, _, rest = cookie.partition("=")
@@ -233,7 +192,7 @@ async def test_a_browser_logs_in_and_out_and_an_old_cookie_is_worth_nothing(prog
             pytest.fail("it was accepted")
 
 
-async def test_a_forged_request_of_a_logged_in_browser_does_nothing(programs: Programs) -> None:
+async def test_a_forged_request_of_a_logged_in_browser_does_nothing(programs: Lab) -> None:
     headers = await programs.browser("supervisor")
     for changed in (
         {"X-Zbridge-Csrf": "x"},
@@ -248,7 +207,7 @@ async def test_a_forged_request_of_a_logged_in_browser_does_nothing(programs: Pr
     assert (await programs.ask("POST", "/api/stop", **headers)).status == 200
 
 
-async def test_a_program_without_users_is_no_page_of_another_site(open_console: Programs) -> None:
+async def test_a_program_without_users_is_no_page_of_another_site(open_console: Lab) -> None:
     assert (await open_console.ask("POST", "/api/stop", Origin="http://evil.example")).status == 403
     forged = {"Sec-Fetch-Site": "cross-site"}
     assert (await open_console.ask("POST", "/api/stop", **forged)).status == 403
@@ -256,7 +215,7 @@ async def test_a_program_without_users_is_no_page_of_another_site(open_console: 
 
 
 @pytest.mark.parametrize("user", ["viewer", "nobody", "", "ann\n", "x" * 2000])
-async def test_a_wrong_password_is_refused_and_says_no_more(programs: Programs, user: str) -> None:
+async def test_a_wrong_password_is_refused_and_says_no_more(programs: Lab, user: str) -> None:
     answer = await programs.log_in(user, "wrong password")
     assert answer.status in (400, 401)
     assert answer.status == 400 or answer.json == {"error": "no such user, or another password"}
@@ -264,7 +223,7 @@ async def test_a_wrong_password_is_refused_and_says_no_more(programs: Programs, 
 
 
 async def test_a_thousand_attempts_are_refused_before_they_are_hashed_and_a_driver_is_not_delayed(
-    programs: Programs, monkeypatch: pytest.MonkeyPatch
+    programs: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hashed = list[str | None]()
     compare = callers.is_password
@@ -276,7 +235,7 @@ async def test_a_thousand_attempts_are_refused_before_they_are_hashed_and_a_driv
     assert len([line for line in programs.journal() if line["action"] == "login"]) <= 200
 
 
-async def test_what_a_role_may_not_is_refused_though_it_sends_the_message_by_hand(programs: Programs) -> None:
+async def test_what_a_role_may_not_is_refused_though_it_sends_the_message_by_hand(programs: Lab) -> None:
     assert (await programs.ask("POST", "/api/unlatch", user="operator")).status == 403
     assert (await programs.ask("POST", "/api/unlatch", {"robot": "r1"}, user="viewer")).status == 403
     headers = await programs.browser("viewer")
@@ -307,7 +266,7 @@ async def test_what_a_role_may_not_is_refused_though_it_sends_the_message_by_han
     assert programs.world.gateway.questions("takeover") == []
 
 
-async def test_what_users_do_is_written_down_with_who_and_what_came_of_it(programs: Programs) -> None:
+async def test_what_users_do_is_written_down_with_who_and_what_came_of_it(programs: Lab) -> None:
     await programs.ask("POST", "/api/robots/r1/stop", user="viewer")
     await programs.log_in("viewer", "wrong password")
     headers = await programs.browser("operator")
@@ -329,7 +288,7 @@ async def test_what_users_do_is_written_down_with_who_and_what_came_of_it(progra
     assert all(line["address"] == "127.0.0.1" and line["time"] for line in programs.journal())
 
 
-async def test_a_user_who_is_removed_is_out_at_once(programs: Programs) -> None:
+async def test_a_user_who_is_removed_is_out_at_once(programs: Lab) -> None:
     headers = await programs.browser("operator")
     async with programs.page(Cookie=headers["Cookie"]) as page:
         save_users(programs.folder / "users.toml", {})
@@ -338,7 +297,7 @@ async def test_a_user_who_is_removed_is_out_at_once(programs: Programs) -> None:
     assert (await programs.ask("GET", "/api/robots", user="operator")).status == 401
 
 
-async def test_a_file_of_users_that_is_broken_keeps_those_of_before_and_is_said(programs: Programs) -> None:
+async def test_a_file_of_users_that_is_broken_keeps_those_of_before_and_is_said(programs: Lab) -> None:
     headers = await programs.browser("operator")
     async with programs.page(Cookie=headers["Cookie"]) as page:
         (programs.folder / "users.toml").write_text("[users")
@@ -352,7 +311,7 @@ async def test_a_file_of_users_that_is_broken_keeps_those_of_before_and_is_said(
 # What it bounds
 
 
-async def test_large_heads_and_bodies_are_refused(programs: Programs) -> None:
+async def test_large_heads_and_bodies_are_refused(programs: Lab) -> None:
     with contextlib.suppress(OSError, http.client.HTTPException):
         answer = await programs.ask("GET", "/", **{"X-Large": "x" * 1_000_000})
         assert answer.status == 400
@@ -362,7 +321,7 @@ async def test_large_heads_and_bodies_are_refused(programs: Programs) -> None:
 
 
 async def test_slow_requests_are_ended_and_idle_connections_bounded(
-    programs: Programs, monkeypatch: pytest.MonkeyPatch
+    programs: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(http_server, "REQUEST_S", 0.5)
     monkeypatch.setattr(http_server, "EACH", 40)
@@ -393,11 +352,11 @@ async def test_slow_requests_are_ended_and_idle_connections_bounded(
 @pytest.mark.parametrize(
     "path", ["/static/../server.py", "/static/%2e%2e/server.py", "/api/../server.py", "//etc/passwd"]
 )
-async def test_no_path_leads_out_of_the_pages(programs: Programs, path: str) -> None:
+async def test_no_path_leads_out_of_the_pages(programs: Lab, path: str) -> None:
     assert (await programs.ask("GET", path)).status == 404
 
 
-async def test_a_host_name_that_somebody_rebound_reaches_nothing(programs: Programs) -> None:
+async def test_a_host_name_that_somebody_rebound_reaches_nothing(programs: Lab) -> None:
     for method, path in (("GET", "/api/robots"), ("POST", "/api/stop"), ("GET", "/")):
         answer = await programs.ask(method, path, user="supervisor", Host="evil.example")
         assert answer.status == 403

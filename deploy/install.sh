@@ -5,15 +5,18 @@ set -euo pipefail
 
 usage() {
     cat <<'END'
-usage: install.sh [--wheels PATH] [--extras LIST] [--router] [--recorder] [--serial] [--no-start]
+usage: install.sh [--wheels PATH] [--extras LIST] [--router] [--recorder] [--console] [--serial] [--no-start]
        install.sh --uninstall [--purge]
 
 --wheels PATH   a folder with the wheels of zbridge and its dependencies, or the zbridge wheel in such a folder; downloads nothing.
-                Build it on a machine with a network: pip wheel -w wheels '.[certs,serial]', with foxglove for --recorder
+                Build it on a machine with a network: pip wheel -w wheels '.[certs,serial]', with foxglove for --recorder,
+                console for --console
                 Without --wheels: installs the checkout that contains this script, and downloads the dependencies.
---extras LIST   extras of zbridge, separated by commas; default "certs,serial", and foxglove with a recorder; "" for none
+--extras LIST   extras of zbridge, separated by commas; default "certs,serial", foxglove with a recorder, console with a
+                console; "" for none
 --router        also run the router of the bus      (/etc/zbridge/router.toml, /etc/zbridge/router)
 --recorder      also record all robots              (/etc/zbridge/recorder.env, /etc/zbridge/recorder)
+--console       also serve the console to browsers  (/etc/zbridge/console.env, /etc/zbridge/console)
 --serial        let gateways open serial lines
 --no-start      enable the units, but start none
 --uninstall     stop and remove the units and /opt/zbridge; keep /etc/zbridge, /var/lib/zbridge and the recordings
@@ -24,10 +27,10 @@ END
 prefix=/opt/zbridge
 etc=/etc/zbridge
 units=/etc/systemd/system
-all_units=(zbridge.service zbridge@.service zbridge-router.service zbridge-recorder.service)
+all_units=(zbridge.service zbridge@.service zbridge-router.service zbridge-recorder.service zbridge-console.service)
 
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
-wheels='' extras=default router='' recorder='' serial='' start=yes uninstall='' purge=''
+wheels='' extras=default router='' recorder='' console='' serial='' start=yes uninstall='' purge=''
 
 say() { printf '%s\n' "zbridge: $*"; }
 die() { printf '%s\n' "zbridge: $*" >&2; exit "${2:-1}"; }
@@ -39,6 +42,7 @@ while [ $# -gt 0 ]; do
         --extras) [ $# -gt 1 ] || wrong "--extras: expected a list"; extras=$2; shift ;;
         --router) router=yes ;;
         --recorder) recorder=yes ;;
+        --console) console=yes ;;
         --serial) serial=yes ;;
         --no-start) start='' ;;
         --uninstall) uninstall=yes ;;
@@ -52,6 +56,7 @@ done
 if [ "$extras" = default ]; then
     extras=certs,serial
     if [ -n "$recorder" ] || [ -L "$units/multi-user.target.wants/zbridge-recorder.service" ]; then extras+=,foxglove; fi
+    if [ -n "$console" ] || [ -L "$units/multi-user.target.wants/zbridge-console.service" ]; then extras+=,console; fi
 fi
 [ "$(id -u)" -eq 0 ] || die "must be run as root"
 
@@ -79,10 +84,10 @@ instances() { # prints the enabled units of single robots
 remove() {
     local unit
     # Instances may run without being enabled. The router stops last, because gateways say goodbye on the bus.
-    for unit in 'zbridge@*.service' zbridge.service zbridge-recorder.service zbridge-router.service; do
+    for unit in 'zbridge@*.service' zbridge.service zbridge-recorder.service zbridge-console.service zbridge-router.service; do
         if booted; then systemctl stop "$unit" 2>/dev/null || ! systemctl is-active --quiet "$unit" || die "$unit did not stop: see journalctl -u ${unit%.service}"; fi
     done
-    for unit in $(instances) zbridge.service zbridge-recorder.service zbridge-router.service; do
+    for unit in $(instances) zbridge.service zbridge-recorder.service zbridge-console.service zbridge-router.service; do
         ! has_systemctl || systemctl disable --quiet "$unit" 2>/dev/null || true
     done
     for unit in "${all_units[@]}"; do rm -f "$units/$unit"; done
@@ -90,7 +95,7 @@ remove() {
     rm -f "$units/zbridge.service.d/serial.conf" /usr/local/bin/zbridge /etc/tmpfiles.d/zbridge.conf
     if booted; then systemctl daemon-reload; systemctl reset-failed 'zbridge*' 2>/dev/null || true; fi
     if [ -n "$purge" ]; then
-        rm -rf "$etc" "$units"/zbridge*.service.d /var/lib/zbridge /var/lib/private/zbridge-recorder /var/lib/zbridge-recorder
+        rm -rf "$etc" "$units"/zbridge*.service.d /var/lib/zbridge /var/lib/private/zbridge-{recorder,console} /var/lib/zbridge-{recorder,console}
         rm -f /etc/sysusers.d/zbridge.conf
         ! getent passwd zbridge >/dev/null || userdel zbridge
         ! getent group zbridge >/dev/null || groupdel zbridge
@@ -143,6 +148,7 @@ install_files() {
     if [ -n "$serial" ] && put "$here/systemd/serial.conf" "$units/zbridge.service.d/serial.conf"; then changed=yes; fi
     keep "$here/zenoh/router.toml" "$etc/router.toml" 0644 || true
     keep "$here/systemd/recorder.env" "$etc/recorder.env" 0640 || true
+    keep "$here/systemd/console.env" "$etc/console.env" 0640 || true
     if booted && [ -n "$changed" ]; then systemctl daemon-reload; fi
 }
 
@@ -165,6 +171,7 @@ install_files
 [ -z "$router" ] || up zbridge-router.service "the router's bundle is in $etc/router" "$etc/router/key.pem"
 up zbridge.service "a robot file is in $etc/robots" "$etc/robots/*.toml"
 [ -z "$recorder" ] || up zbridge-recorder.service "the recorder's bundle is in $etc/recorder" "$etc/recorder/key.pem"
+[ -z "$console" ] || up zbridge-console.service "the console's bundle and users.toml are in $etc/console" "$etc/console/users.toml"
 if booted && systemctl is-active --quiet zbridge.service; then
     sleep 3 # a supervisor loads only code that has not changed for 2 s
     say "running gateways keep their version. To upgrade them: systemctl reload zbridge, then zbridge restart --all"

@@ -27,10 +27,10 @@ robot
 compose up -d --no-build || fail "podman-compose up"
 established() { python "$root/deploy/try/established.py" wall r1; }
 established || fail "r1 is not established"
-ok "router, gateways and recorder run; r1 is established over mutual TLS"
+ok "router, gateways, recorder and console run; r1 is established over mutual TLS"
 container() { podman ps --filter "name=$1" --format '{{.Names}}'; }
-router=$(container router) gateways=$(container gateways) recorder=$(container recorder)
-for name in $router $gateways $recorder; do
+router=$(container router) gateways=$(container gateways) recorder=$(container recorder) console=$(container console)
+for name in $router $gateways $recorder $console; do
     podman exec "$name" sh -c 'touch /x 2>/dev/null' && fail "$name: the root file system is writable"
     podman exec "$name" sh -c 'grep -q "^CapBnd:.0*$" /proc/1/status && grep -q "^NoNewPrivs:.1" /proc/1/status && [ "$(id -u)" = 10001 ]' || fail "$name has capabilities, new privileges or another user"
 done
@@ -70,6 +70,11 @@ robot
 established || fail "r1 is not established again"
 [ "$(main)" != "$before" ] || fail "the container was not restarted"
 ok "supervisor killed: $rest; the container was restarted"
+
+seen() { curl --silent --fail --cacert certs/ca.pem -H "Authorization: Bearer $(cat token)" "https://localhost:8443/api/robots/r1/status" | grep -q '"state":"established"'; }
+within 20 seen || { curl -v --cacert certs/ca.pem https://localhost:8443/api/me 2>&1 | tail -n 20; fail "the console does not show r1"; }
+[ "$(curl --silent --output /dev/null --write-out '%{http_code}' --cacert certs/ca.pem https://localhost:8443/api/robots)" = 401 ] || fail "the console needs no login"
+ok "the console shows r1 over TLS to who has a token, and to nobody else"
 
 recorded() { podman exec "$recorder" sh -c 'find /var/lib/zbridge-recorder -name "*.mcap" -size +20k | grep .' 2>/dev/null; }
 within 30 recorded || fail "nothing is recorded"

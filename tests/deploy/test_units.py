@@ -27,8 +27,9 @@ def settings(unit: Path) -> dict[str, list[str]]:
     return found
 
 
-def test_there_is_a_unit_for_the_host_for_one_robot_for_the_router_and_for_the_recorder() -> None:
+def test_there_is_a_unit_for_the_host_for_one_robot_and_for_router_recorder_and_console() -> None:
     assert [unit.name for unit in UNITS] == [
+        "zbridge-console.service",
         "zbridge-recorder.service",
         "zbridge-router.service",
         "zbridge.service",
@@ -55,10 +56,11 @@ def test_a_unit_starts_again_for_ever_whatever_ended_it(unit: Path) -> None:
 @pytest.mark.parametrize(
     ("unit", "secrets"),
     [
-        ("zbridge.service", ("router", "recorder")),
-        ("zbridge@.service", ("router", "recorder")),
-        ("zbridge-router.service", ("bus", "recorder")),
-        ("zbridge-recorder.service", ("bus", "router")),
+        ("zbridge.service", ("router", "recorder", "console")),
+        ("zbridge@.service", ("router", "recorder", "console")),
+        ("zbridge-router.service", ("bus", "recorder", "console")),
+        ("zbridge-recorder.service", ("bus", "router", "console")),
+        ("zbridge-console.service", ("bus", "router", "recorder")),
     ],
 )
 def test_a_unit_cannot_see_the_keys_of_the_others(unit: str, secrets: tuple[str, ...]) -> None:
@@ -94,7 +96,7 @@ def test_commands_of_a_unit_exist_with_their_options(unit: Path) -> None:
 
 
 def test_every_credential_of_a_unit_is_used_under_its_name() -> None:
-    for name in ("router", "recorder"):
+    for name in ("router", "recorder", "console"):
         loaded = settings(SYSTEMD / f"zbridge-{name}.service")["LoadCredential"]
         assert {f"{file}:/etc/zbridge/{name}/{file}" for file in ("ca.pem", "certificate.pem", "key.pem")} <= set(
             loaded

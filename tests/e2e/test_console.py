@@ -73,7 +73,7 @@ class Scene:
         command = ("console", "--listen", f"{HOST}:0", "--roster", str(bench.folder / "roster"))
         self.console = bench.zbridge(*command, "--connect", bench.endpoint)
         assert self.console.stdout is not None
-        at = self.console.stdout.readline().split()[-1]
+        at = self.at = self.console.stdout.readline().split()[-1]
         opened = connect(f"ws{at.removeprefix('http')}/socket", origin=at, proxy=None)  # type: ignore[arg-type]
         self.page = Page(stack.enter_context(opened))
         self.page.until(lambda: self.page.states() == dict.fromkeys(ROBOTS, "established"), "all robots", 30.0)
@@ -144,3 +144,48 @@ def test_a_robot_that_was_seen_by_an_earlier_console_is_missing_in_the_next(scen
         page.until(lambda: page.states().get("w1") == "NO GATEWAY", "w1 missing")
         assert "w1 without a gateway" in page.ask("stop_all")
     end(console)
+
+
+def test_two_consoles_on_one_bus_agree(scene: Scene) -> None:
+    bench = scene.bench
+    options = ("--listen", f"{HOST}:0", "--roster", str(bench.folder / "other"))
+    other = bench.zbridge("console", *options, "--connect", bench.endpoint)
+    assert other.stdout is not None
+    at = other.stdout.readline().split()[-1]
+    with connect(f"ws{at.removeprefix('http')}/socket", origin=at, proxy=None) as opened:  # type: ignore[arg-type]
+        second = Page(opened)
+        second.until(lambda: second.states() == dict.fromkeys(ROBOTS, "established"), "all robots", 30.0)
+        assert scene.page.ask("stop_all") == f"3 of 3 {CONFIRMED}"
+        for page in (scene.page, second):
+            page.until(lambda: set(page.states().values()) == {"LATCHED"}, "all latched")  # noqa: B023
+        assert second.ask("release") == "3 of 3 released"
+        for page in (scene.page, second):
+            page.until(lambda: set(page.states().values()) == {"established"}, "all released")  # noqa: B023
+    end(other)
+
+
+def test_a_console_that_is_killed_stops_the_robot_that_it_drives_and_disturbs_nothing_else(scene: Scene) -> None:
+    fleet = scene.bench.fleet
+    fleet.hold("a1")
+    scene.page.until(lambda: scene.page.rows["a1"]["driver"] == "test", "the driver of a1")
+    at = scene.at
+    with connect(f"ws{at.removeprefix('http')}/drive/t1", origin=at, proxy=None) as drive:  # type: ignore[arg-type]
+        drive.send(json.dumps({"do": "take"}))
+        seq = moved = 0
+        while moved < 5:
+            message = json.loads(drive.recv(timeout=10))
+            if "tick" not in message:
+                continue
+            seq += 1
+            moved += seq > 5
+            command = {"do": "drive", "seq": seq, "tick": message["tick"], "forward": 0.5 if moved else 0.0}
+            drive.send(json.dumps(command))
+        assert fleet.last("t1/control")["holder"].startswith("console.browser")
+        scene.console.kill()
+        killed = time.monotonic()
+        until(lambda: fleet.last("t1/control")["state"] == "stopped", what="t1 is stopped")
+        assert fleet.last("t1/control")["at"] - killed < 1.0 + scene.bench.withheld_s
+    assert fleet.last("a1/control")["holder"] == "test"
+    assert not fleet.lost("a1")
+    fleet.put("a1/@cmd/drive", forward=0.1)
+    assert all(fleet.state(robot) == "established" for robot in ROBOTS)

@@ -18,10 +18,12 @@ from zbridge.views.console.roster import Roster
 
 
 @contextlib.asynccontextmanager
-async def served(fleet: Fleet, bus: Bus, roster: Path | Roster, **settings: Any) -> AsyncIterator[str]:
-    """Serve a console; give its address."""
+async def served(
+    fleet: Fleet, bus: Bus, roster: Path | Roster, *, port: int = 0, **settings: Any
+) -> AsyncIterator[str]:
+    """Serve a console; give its address for browsers."""
     ready: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-    with contextlib.closing(listener(Address(HOST, 0))) as listening:
+    with contextlib.closing(listener(Address(HOST, port))) as listening:
         known = roster if isinstance(roster, Roster) else Roster(roster)
         made = server.ConsoleSettings(Address(HOST, 0), **settings)
         serving = asyncio.create_task(server.serve(fleet, bus, made, listening, known, ready.set_result))

@@ -54,7 +54,7 @@ def test_users_are_kept_hashed_and_for_their_owner_only(tmp_path: Path) -> None:
     assert "correct horse" not in content
 
 
-@pytest.mark.parametrize("mode", [0o640, 0o604, 0o660, 0o602])
+@pytest.mark.parametrize("mode", [0o604, 0o660, 0o620, 0o602])
 def test_a_file_that_others_can_read_or_write_is_an_error(tmp_path: Path, mode: int) -> None:
     file = tmp_path / "users.toml"
     save_users(file, {"ann": ANN})

@@ -49,12 +49,12 @@ class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def load_users(path: Path) -> dict[str, User]:
-    """Read the users; raise ConfigError, which names the file, also if others can read or write it."""
+    """Read the users; raise ConfigError, which names the file, also if others can read it, or a group can write it."""
     try:
         mode = path.stat().st_mode
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror or error}") from error
-    if mode & (stat.S_IRWXG | stat.S_IRWXO):
+    if mode & (stat.S_IWGRP | stat.S_IRWXO):  # systemd and Kubernetes let the group of a service read its secrets
         raise ConfigError(f"{path}: mode {stat.S_IMODE(mode):04o}: others can read or write it; expected 0600")
     raw = read_toml(path)
     with prefixed(f"{path}: "):

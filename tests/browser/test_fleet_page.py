@@ -27,7 +27,7 @@ STATES = [
 ]
 NOBODY_ANSWERS = """() => {
   window.Real = WebSocket;
-  WebSocket = class { constructor() { setTimeout(() => this.onclose(), 10); } };
+  WebSocket = class { constructor() { setTimeout(() => this.onclose({ code: 1006 }), 10); } };
 }"""
 CONTROLS = ["Filter robots", "established 6", "tcpudp 10", "Stop free", "Forget killed", "free", "zbridge fleet"]
 

@@ -11,7 +11,7 @@ from collections.abc import Coroutine, Iterator, Mapping
 from typing import Any
 
 import msgspec
-from starlette.websockets import WebSocket
+from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketDisconnected
 
 from zbridge.bus import Bus
 from zbridge.client.fleet import Fleet
@@ -259,5 +259,5 @@ async def _await(work: Coroutine[Any, Any, object]) -> None:
 
 
 async def _end(socket: WebSocket) -> None:
-    with contextlib.suppress(RuntimeError):  # it has ended meanwhile
+    with contextlib.suppress(WebSocketDisconnect, WebSocketDisconnected):
         await socket.close(FORBIDDEN, "the login has ended")

@@ -7,7 +7,7 @@ import contextlib
 from typing import Annotated, Any, Literal
 
 import msgspec
-from starlette.websockets import WebSocket, WebSocketDisconnect
+from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketDisconnected
 
 from zbridge.fleet.messages import Drive
 from zbridge.metrics import Metrics
@@ -76,7 +76,7 @@ class DriveSocket:
         """Serve the page until it leaves, or sends what it must not; the robot is sent neutral then."""
         self._sit(self._seat)
         try:
-            with contextlib.suppress(WebSocketDisconnect):
+            with contextlib.suppress(WebSocketDisconnect, WebSocketDisconnected):
                 await race(self._receive(), self._send())
         finally:
             self._cancel_timer()

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Annotated, Literal
 
 import msgspec
-from starlette.websockets import WebSocket, WebSocketDisconnect
+from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketDisconnected
 
 from zbridge.fleet.topics import is_name
 from zbridge.protocol.rate_limit import RateLimit
@@ -104,7 +104,7 @@ class Page:
 
     async def serve(self) -> None:
         """Serve the page until it leaves, or sends what it must not."""
-        with contextlib.suppress(WebSocketDisconnect):
+        with contextlib.suppress(WebSocketDisconnect, WebSocketDisconnected):
             await race(self._send(), self._send_warnings(), self._show_robot(), self._receive())
 
     async def _send(self) -> None:

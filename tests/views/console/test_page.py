@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
+from starlette.websockets import WebSocketDisconnect, WebSocketDisconnected
 
 from zbridge.views.console import page as page_module
 from zbridge.views.console.page import FleetFollower, Page
@@ -123,3 +124,13 @@ async def test_a_page_that_looks_again_gets_all_again(monkeypatch: pytest.Monkey
             await take(socket, 1)
             page.look(None)
         assert socket.sent == ["all", "robot 5", "robot 5"]
+
+
+@pytest.mark.parametrize("error", [WebSocketDisconnect(1006), WebSocketDisconnected("closed")])
+async def test_a_page_that_has_left_while_something_is_sent_to_it_ends_without_an_error(error: Exception) -> None:
+    class Gone(SlowSocket):
+        async def send_text(self, text: str) -> None:
+            raise error
+
+    socket: Any = Gone()
+    await Page(socket, FleetFollower(lambda: b"all"), lambda request: None).serve()

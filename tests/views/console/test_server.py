@@ -165,29 +165,6 @@ async def test_a_page_that_is_closed_looks_at_nothing(scene: Scene) -> None:
             await asyncio.sleep(0.01)
 
 
-async def test_pages_that_leave_while_they_are_sent_something_are_no_error(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.setattr(page, "PICTURES_HZ", 2000.0)
-
-    async def publish() -> None:
-        while True:
-            scene.world.pose(1.0)
-            await asyncio.sleep(0)
-
-    publishing = asyncio.create_task(publish())
-    for number in range(60):
-        async with scene.page() as opened:
-            await opened.send(json.dumps({"do": "look", "robot": "r1"}))
-            await opened.send(json.dumps({"do": "forget", "robot": "r1"}))
-            await robot_news(opened, "pose")
-            if number % 2:
-                opened.transport.abort()
-    publishing.cancel()
-    await asyncio.sleep(0.2)
-    assert [record.getMessage() for record in caplog.records if record.levelname == "ERROR"] == []
-
-
 async def test_who_drove_and_who_stopped_a_robot_is_told(scene: Scene) -> None:
     async with scene.page() as opened:
         await opened.send(json.dumps({"do": "look", "robot": "r1"}))

@@ -36,7 +36,7 @@ BLOCK = re.compile(r"^```\w*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 GROUPS = ("zbridge.protocols", "zbridge.service")
 """Dotted names that are no modules: the entry-point group, the unit of systemd."""
 THEIRS = (
-    *("hq.toml", "r1.toml", "r2.toml", "e1.toml", "host.toml", "router.toml", "roles.toml", "bus.toml"),
+    *("users.toml", "hq.toml", "r1.toml", "r2.toml", "e1.toml", "host.toml", "router.toml", "roles.toml", "bus.toml"),
     *("pyproject.toml", "README.md", "CHANGELOG.md"),
 )
 """Files that a reader writes, or that stand at the root of every package."""
@@ -102,9 +102,9 @@ def test_every_command_that_is_named_exists_with_its_options(page: Path) -> None
     for name, rest in COMMAND.findall("\n".join([*BLOCK.findall(text), *SPAN.findall(BLOCK.sub("", text))])):
         assert name in commands, f"zbridge {name}"
         command = commands[name]
-        if isinstance(command, TyperGroup) and (sub := re.match(r" ([a-z]+)", rest)):
+        while isinstance(command, TyperGroup) and (sub := re.match(r" ([a-z]+)", rest)):
             assert sub[1] in command.commands, f"zbridge {name} {sub[1]}"
-            command = command.commands[sub[1]]
+            command, rest = command.commands[sub[1]], rest[sub.end() :]
         known = {option for parameter in command.params for option in parameter.opts}
         unknown = set(re.findall(r"--[a-z-]+", rest.partition("#")[0].partition("&&")[0])) - known
         assert not unknown, f"zbridge {name} {rest}"

@@ -364,8 +364,8 @@ class Wire:
         self.held.clear()
 
     async def cut(self) -> None:
+        await self._page.close()  # first: nothing more is passed on to a server that has ended
         await self._server.close()
-        await self._page.close()
 
 
 @pytest.mark.parametrize("direction", ["up", "down"])
@@ -457,8 +457,8 @@ async def test_a_second_browser_is_refused_sees_by_whom_and_may_take_over(lane: 
     await second.get_by_text("console.browser1 drives").first.wait_for()
     await second.get_by_role("button", name="Take control").click()
     question = second.locator(".drive .question")
-    assert "console.browser1 drives r1, and loses control" in (await question.inner_text())
-    await second.get_by_role("button", name="Cancel").click()
+    assert "console.browser1 is driving now, and loses control at once" in (await question.inner_text())
+    await second.get_by_role("button", name="Keep watching").click()
     await second.get_by_role("button", name="Take control").click()
     await second.get_by_role("button", name="Take over").click()
     await second.get_by_text("Ready.").wait_for()
@@ -475,7 +475,9 @@ async def test_who_drives_by_another_program_refuses_the_page(lane: Lane) -> Non
             "document.querySelector('.drive button').click()"
         )
         await drive()
-        await page.get_by_text("r1 is held by ann@desk").or_(page.get_by_text("ann@desk drives r1")).first.wait_for()
+        await (
+            page.get_by_text("r1 is held by ann@desk").or_(page.get_by_text("ann@desk is driving now")).first.wait_for()
+        )
     assert await page.get_by_text("You drive r1").count() == 0
 
 
@@ -488,6 +490,12 @@ async def test_modes_and_motors_are_there_for_what_the_robot_accepts(lane: Lane)
     await page.get_by_role("button", name="manual").click()
     await page.get_by_role("button", name="manual", pressed=True).wait_for()
     assert ("mode", Mode("manual")) in lane.robot.machine.commands
+    await page.get_by_role("button", name="autonomous", exact=True).click()
+    await page.get_by_text("r1 then moves by itself.").wait_for()
+    assert ("mode", Mode("autonomous")) not in lane.robot.machine.commands
+    await page.get_by_role("button", name="Set autonomous").click()
+    await soon(lambda: ("mode", Mode("autonomous")) in lane.robot.machine.commands)
+    await page.get_by_text("Single motors").click()
     button = page.get_by_role("button", name="left wheel forwards")
     await button.hover()
     await page.mouse.down()

@@ -58,7 +58,7 @@ async def takes_over(scene: Room, other: str) -> Any:
     page = await scene.browser.open(ROBOT)
     await page.locator(".title .driver").get_by_text(other).wait_for()
     await page.get_by_role("button", name="Take control").click()
-    await page.get_by_text("and loses control").wait_for()
+    await page.get_by_text("loses control at once").wait_for()
     await page.get_by_role("button", name="Take over").click()
     await page.get_by_text("Ready.").wait_for()
     await scene.rests(1.0)

@@ -29,7 +29,8 @@ NOBODY_ANSWERS = """() => {
   window.Real = WebSocket;
   WebSocket = class { constructor() { setTimeout(() => this.onclose({ code: 1006 }), 10); } };
 }"""
-CONTROLS = ["Filter robots", "established 6", "tcpudp 10", "Stop free", "Forget killed", "free", "zbridge fleet"]
+FILTERS = ["Connected 5", "tcpudp 10"]
+CONTROLS = ["Filter robots", *FILTERS, "Stop free", "Forget killed", "free", "zbridge console"]
 
 
 @pytest.mark.parametrize(("size", "scheme"), [(WIDE, "light"), (NARROW, "dark")])
@@ -67,7 +68,7 @@ async def test_filters_by_state_and_protocol_are_buttons_that_are_pressed(browse
     assert await page.locator(".tall .name").all_inner_texts() == ["r2"]
     assert await page.get_by_role("button", name="alf 1").get_attribute("aria-pressed") == "true"
     await page.get_by_role("button", name="alf 1").click()
-    await page.get_by_role("button", name="offline 1").click()
+    await page.get_by_role("button", name="Offline 1").click()
     assert await page.locator(".tall .name").all_inner_texts() == ["r3"]
 
 
@@ -95,7 +96,7 @@ async def test_escape_stops_whatever_has_the_focus_and_once_for_each_press(brows
     await page.locator(".tall .row").first.wait_for()
     for number, name in enumerate(CONTROLS, 1):
         control = page.get_by_label(name, exact=True).or_(page.get_by_text(name, exact=True)).first
-        focusable = control if name not in ("established 6", "tcpudp 10") else page.get_by_role("button", name=name)
+        focusable = control if name not in FILTERS else page.get_by_role("button", name=name)
         await focusable.focus()
         await page.keyboard.press("Escape")
         await soon(lambda: len(feed.asked) >= number)  # noqa: B023
@@ -113,10 +114,11 @@ async def test_release_asks_once_more_and_only_where_a_robot_is_latched(browser:
     feed.tell(rows=[row("r1", "LATCHED", 8, latched=["latched"])])
     await page.get_by_role("button", name="Release").click()
     assert feed.asked == []
-    assert "1 robot may be driven again?" in await page.locator(".question").inner_text()
-    await page.get_by_role("button", name="Cancel").click()
-    await page.get_by_role("button", name="Release").click()
-    await page.get_by_role("button", name="Release").click()
+    question = await page.locator(".question").inner_text()
+    assert "Release 1 robot? Programs and people can move them again at once." in question
+    await page.get_by_role("button", name="Keep latched").click()
+    await page.get_by_role("button", name="Release", exact=True).click()
+    await page.get_by_role("button", name="Release 1 robot").click()
     await soon(lambda: feed.asked)
     assert feed.asked == [{"do": "release"}]
 
@@ -149,8 +151,23 @@ async def test_a_notice_is_read_out_and_hostile_text_stays_text(browser: Browser
     feed = Feed(row("r1"), notices={"all": {"text": EVIL, "at": 1_700_000_000, "good": False}})
     page = await browser.open(feed=feed)
     status = page.get_by_role("status")
-    assert EVIL in await status.inner_text()
+    await status.get_by_text(EVIL).wait_for()
     assert await status.get_attribute("aria-live") == "assertive"
     feed.tell(bus=False)
     await page.get_by_text("The bus is lost").wait_for()
     assert browser.complaints == []
+
+
+async def test_a_confirmed_stop_tells_to_watch_the_robots_and_its_notice_ends_by_itself(browser: Browser) -> None:
+    good = {"text": "1 of 1 stopped (their gateways sent it)", "at": 1_700_000_000, "good": True}
+    feed = Feed(row("r1"), notices={"all": good})
+    page = await browser.open(feed=feed)
+    await page.get_by_text("Sent is not stopped: watch the robots.").wait_for()
+    feed.tell(notices={"all": good, "one": {"text": "r1 is not confirmed", "at": 1_700_000_000, "good": False}})
+    await page.get_by_text("r1 is not confirmed").wait_for()
+    await page.evaluate(
+        "() => { const now = performance.now.bind(performance); performance.now = () => now() + 61000; }"
+    )
+    feed.tell()
+    await page.get_by_text("Sent is not stopped").wait_for(state="detached")
+    assert await page.get_by_text("r1 is not confirmed").count() == 1

@@ -373,6 +373,32 @@ async def test_a_page_that_sends_too_much_is_closed(scene: Scene, robot: Gateway
         await closed(socket)
 
 
+async def test_what_a_robot_cannot_do_of_a_command_is_said_and_the_rest_moves_it(scene: Scene, robot: Gateway) -> None:
+    async with opened(scene) as driver:
+        await driver.take()
+        robot.machine.left_out = "turn: it cannot"
+        await driver.drive(0.5, turn=0.5)
+        await driver.until(lambda control: "turn: it cannot" in (control["notice"] or ""))
+        count = len(robot.driven)
+        await soon(lambda: len(robot.driven) > count + 10)
+        assert all(drive.forward == 0.5 for drive in robot.driven[count:])  # type: ignore[attr-defined]
+        assert driver.control["needs"] is None
+        robot.machine.left_out = None
+        await driver.drive(0.0)
+        await driver.until(lambda control: control["notice"] is None)
+
+
+async def test_a_refused_command_stops_and_says_why(scene: Scene, robot: Gateway) -> None:
+    async with opened(scene) as driver:
+        await driver.take()
+        await driver.drive(0.5)
+        await soon(lambda: moves(robot))
+        robot.machine.refusal = "it saves its map"
+        await driver.until(lambda control: "it saves its map" in (control["needs"] or ""))
+        robot.machine.refusal = None
+        await rests(robot)
+
+
 async def test_a_mode_and_single_motors_go_by_the_lease(scene: Scene, robot: Gateway) -> None:
     async with opened(scene) as driver:
         await driver.say(do="mode", mode="manual")

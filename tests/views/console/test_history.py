@@ -34,7 +34,7 @@ ANN = Control("held", holder="ann", lease=b"lease--1")
         (Control("stopped", stops=(OTHER,)), Control("stopped", stops=(OTHER, OWN)), ["stopped by this console"]),
         (ANN, Control("latched", latches=(WET,), stops=(OTHER,)), ["latched by bob (wet floor): ann no longer drives"]),
         (FREE, Control("latched", latches=(WET,)), ["latched by bob (wet floor)"]),
-        (Control("latched", latches=(WET,)), Control("stopped"), ["released: latched by bob (wet floor)"]),
+        (Control("latched", latches=(WET,)), Control("stopped"), ["no longer latched by bob (wet floor)"]),
     ],
 )
 def test_what_happened_between_two_messages(before: Control, now: Control, texts: list[str]) -> None:

@@ -159,7 +159,7 @@ class DriveSocket:
             self._link.sent(moving=command.moving)
         elif command.moving:
             self._count("refused")
-            self._halt(self._seat.needs_neutral or "the command was refused", again=False)
+            self._halt(self._seat.needs_neutral or self._seat.notice or "the command was refused", again=False)
 
     def _halt(self, why: str, *, again: bool = True) -> None:
         """Stop the robot, and require neutral. again: also if that is required already."""

@@ -103,7 +103,7 @@ def changes(before: Control, now: Control, own: dict[bytes, str]) -> list[str]:
         else:
             texts.append((f"stopped by {own[stop]}" if stop in own else "a stop") + whom)
     texts += [latch.described for latch in now.latches if latch.id not in known and latch.id not in new_stops]
-    texts += [f"released: {latch.described}" for latch in before.latches if latch.id not in latches]
+    texts += [f"no longer {latch.described}" for latch in before.latches if latch.id not in latches]
     return texts + _holder_changes(before, now, new_stops)
 
 

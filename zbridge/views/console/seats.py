@@ -16,7 +16,7 @@ from functools import partial
 
 from zbridge.client.fleet import Fleet
 from zbridge.client.pilot import Pilot
-from zbridge.errors import NeutralFirst, NotReady, Refused, ZbridgeError
+from zbridge.errors import NeutralFirst, NotReady, Refused, Unsupported, ZbridgeError
 from zbridge.fleet.messages import Drive
 from zbridge.fleet.printable import shown
 from zbridge.lease.stick import Stick, StickRules
@@ -103,35 +103,49 @@ class Seat:
         """Send the robot a command; return whether it was sent. A motor that was moved is sent 0 by the next drive."""
         if self._pilot is None:
             return False
-        needed, self.notice = self._pilot.stick.needs_neutral, None
+        before = (self.needs_neutral, self.notice)
+        if motor is None and not drive.moving:
+            self.notice = None
         try:
-            if motor is not None:
-                self._motor = motor.name if not motor.linear else None
-                self._pilot.motor(motor.name, motor.value)
-            elif "drive" in self._accepts():
-                self._pilot.drive(drive)
-            elif self._motor is not None and not drive.moving:
-                self._pilot.motor(self._motor, 0.0)
-            elif not drive.moving:
-                self._pilot.rest()
-            else:
-                raise NotReady(f"{self.robot} accepts no drive now")
+            self._send(self._pilot, drive, motor)
         except NeutralFirst:
             return False
         except Refused as refusal:
             self.notice = shown(refusal, _REASON)
             return False
         finally:
-            if needed != self._pilot.stick.needs_neutral or self.notice is not None:
+            if before != (self.needs_neutral, self.notice):
                 self.changed()
         return self.held
+
+    def _send(self, pilot: Pilot, drive: Drive, motor: MotorCommand | None) -> None:
+        try:
+            self._give(pilot, drive, motor)
+        except Unsupported as refusal:  # of the command before: what the robot cannot do of it was left out
+            self.notice = f"in part only: {shown(refusal, _REASON)}"
+            self._give(pilot, drive, motor)
+
+    def _give(self, pilot: Pilot, drive: Drive, motor: MotorCommand | None) -> None:
+        if motor is not None:
+            self._motor = motor.name if not motor.linear else None
+            pilot.motor(motor.name, motor.value)
+        elif "drive" in self._accepts():
+            pilot.drive(drive)
+        elif self._motor is not None and not drive.moving:
+            pilot.motor(self._motor, 0.0)
+        elif not drive.moving:
+            pilot.rest()
+        else:
+            raise NotReady(f"{self.robot} accepts no drive now")
 
     def halt(self, why: str, *, moving: bool) -> None:
         """Require neutral. moving: whether the robot was sent motion last: it is sent neutral then."""
         if self._pilot is None:
             return
+        notice = self.notice
         if moving:
             self.drive(Drive())
+        self.notice = notice
         self._pilot.require_neutral(why)
         self.changed()
 

@@ -30,6 +30,7 @@ export class Drive {
     this.wasBlocked = null;
     this.padChanges = 0;
     this.moving = false;
+    this.sent = { ...NEUTRAL, motor: null }; // what the robot is told
     this.lostAt = null;
     this.changed = () => {};
     this.wakeLock = null;
@@ -206,6 +207,7 @@ export class Drive {
     if (this.sentAt.size > 100) this.sentAt.delete(this.sentAt.keys().next().value);
     const { epoch, why, seq } = this;
     this.say({ do: "drive", seq, tick: this.tick.number, epoch, why, ...command });
+    this.sent = command;
     this.moving = !isNeutral(command) || Boolean(motor?.value);
   }
 

@@ -1,38 +1,26 @@
 // The fleet page: a row for each robot, of which only those in sight are drawn; one canvas for all sparklines.
 
 import { html, useEffect, useRef, useState } from "./vendor/htm-preact.js";
-import { leave } from "./header.js";
+import { counted, doubtOf, driverOf, leave, toneOf, whyOf, wordOf } from "./words.js";
 
 const SPARK = 96; // width of a sparkline, pixels
 const WIDE = "(min-width: 760px)";
 
+const FIELDS = { state: wordOf, protocol: (row) => row.protocol };
+
 const filters = { words: "", state: "", protocol: "" };
 
-export const tone = (row) => {
-  if (row.state === "established") return row.driver === "stopped" ? "wait" : "good";
-  return ["connecting", "handshaking", "closing", "unknown"].includes(row.state) ? "wait" : "bad";
-};
-
-export function since(seconds) {
-  const age = Math.max(0, Math.round(Date.now() / 1000 - seconds));
-  if (age < 120) return `${age} s ago`;
-  return age < 7200 ? `${Math.round(age / 60)} min ago` : `${Math.round(age / 3600)} h ago`;
-}
-
-const number = (value) => (value === null ? "" : String(value));
-
 function matches(row) {
-  const text = [row.name, row.state, row.protocol, row.version, row.driver, row.reason, row.host].join("\n").toLowerCase();
+  const text = [row.name, wordOf(row), row.protocol, row.version, row.driver, row.reason, row.host].join("\n").toLowerCase();
   return (
-    (!filters.state || row.state === filters.state) &&
-    (!filters.protocol || row.protocol === filters.protocol) &&
+    Object.entries(FIELDS).every(([field, read]) => !filters[field] || read(row) === filters[field]) &&
     filters.words.toLowerCase().split(/\s+/).every((word) => text.includes(word))
   );
 }
 
-function counted(rows, field) {
+function countedBy(rows, read) {
   const counts = new Map();
-  for (const row of rows) if (row[field]) counts.set(row[field], (counts.get(row[field]) ?? 0) + 1);
+  for (const value of rows.map(read)) if (value) counts.set(value, (counts.get(value) ?? 0) + 1);
   return [...counts].sort(([a], [b]) => a.localeCompare(b));
 }
 
@@ -41,7 +29,7 @@ function Choices({ name, field, rows, redraw }) {
     filters[field] = filters[field] === value ? "" : value;
     redraw();
   };
-  const found = counted(rows, field);
+  const found = countedBy(rows, FIELDS[field]);
   if (found.length < 2 && !filters[field]) return null;
   return html`<div class="choices" role="group" aria-label=${name}>
     ${found.map(
@@ -58,16 +46,19 @@ export function Fleet({ store }) {
   const redraw = () => turn((count) => count + 1);
   const all = [...store.rows.values()];
   const rows = all.filter(matches).sort((a, b) => a.severity - b.severity || a.name.localeCompare(b.name, undefined, { numeric: true }));
+  const doubtful = all.filter(doubtOf).length;
   const find = (event) => {
     filters.words = event.target.value;
     redraw();
   };
   return html`<section class="fleet">
     <div class="tools">
-      <h1>${all.length} ${all.length === 1 ? "robot" : "robots"}</h1>
-      <input type="search" aria-label="Filter robots" placeholder="Filter" value=${filters.words} onInput=${find} />
-      <${Choices} name="State" field="state" rows=${all} redraw=${redraw} />
-      <${Choices} name="Protocol" field="protocol" rows=${all} redraw=${redraw} />
+      <h1>${counted(all.length, "robot")}${doubtful > 0 && html`, <span class="doubt">${doubtful} ${doubtful === 1 ? "needs" : "need"} attention</span>`}</h1>
+      <div class="filters">
+        <input type="search" aria-label="Filter robots" placeholder="Filter" value=${filters.words} onInput=${find} />
+        <${Choices} name="State" field="state" rows=${all} redraw=${redraw} />
+        <${Choices} name="Protocol" field="protocol" rows=${all} redraw=${redraw} />
+      </div>
     </div>
     ${!all.length && html`<p class="empty">No robot is on the bus. Start a gateway: <code>zbridge run r1.toml</code></p>`}
     ${all.length > 0 && !rows.length && html`<p class="empty">No robot matches the filter.</p>`}
@@ -111,19 +102,18 @@ function Row({ row, store, place, top }) {
     leave(event);
     store.send({ do: "forget", robot: row.name });
   };
-  const missing = row.state === "NO GATEWAY";
-  const why = [row.seen !== null ? `last seen ${since(row.seen)}` : "", row.reason].filter(Boolean).join("; ");
-  return html`<div role="row" class="row ${tone(row)}" aria-rowindex=${place + 2} style=${{ top: `${top}px` }}>
+  const [missing, driver] = [row.state === "NO GATEWAY", driverOf(row)];
+  const why = [doubtOf(row) && "Stop may not reach it", whyOf(row)].filter(Boolean).join("; ");
+  return html`<div role="row" class="row ${toneOf(row)}" aria-rowindex=${place + 2} style=${{ top: `${top}px` }}>
     <span role="cell" class="name"><a href=${`#/robot/${encodeURIComponent(row.name)}`}>${row.name}</a></span>
-    <span role="cell" class="state"><b>${row.state}</b> <span class="why" title=${why}>${why}</span></span>
-    <span role="cell" class="driver" title=${row.driver}>${row.driver}</span>
+    <span role="cell" class="state"><b>${wordOf(row)}</b>
+      ${missing && store.may("forget") && html` <button type="button" aria-label=${`Forget ${row.name}`} onClick=${forget}>Forget</button>`}
+      <span class="why" title=${why}>${why}</span></span>
+    <span role="cell" class="driver ${driver ? "" : "empty"}" title=${driver}>${driver ?? "not known"}${driver === "" && "nobody"}</span>
     <span role="cell" class="protocol">${row.protocol} ${row.version}</span>
     <span role="cell" class="rate">${row.rate === null ? "" : row.rate.toFixed(1)}</span>
-    <span role="cell" class="refused">${number(row.refused)}</span>
-    <span role="cell" class="act">
-      ${missing && store.may("forget") && html`<button type="button" aria-label=${`Forget ${row.name}`} onClick=${forget}>Forget</button>`}
-      ${!missing && html`<button type="button" class="stop" aria-label=${`Stop ${row.name}`} onClick=${stop}>Stop</button>`}
-    </span>
+    <span role="cell" class="refused">${row.refused}</span>
+    <span role="cell" class="act"><button type="button" class="stop" aria-label=${`Stop ${row.name}`} onClick=${stop}>Stop</button></span>
   </div>`;
 }
 

@@ -2,32 +2,28 @@
 
 import { html, useState } from "./vendor/htm-preact.js";
 import { logOut } from "./login.js";
+import { counted, leave, span } from "./words.js";
 
-export function leave(event) {
-  event.currentTarget.blur(); // the space bar would click it again
-}
+const GOOD_S = 60; // for so long a notice is shown that asks nobody for anything
+const SENT = "gateways sent it";
 
 export function Header({ store }) {
-  const rows = [...store.rows.values()];
-  const latched = rows.filter((row) => row.latched.length).length;
+  const latched = [...store.rows.values()].filter((row) => row.latched.length).length;
+  const live = store.connected && !store.silent && store.bus;
+  const stopAll = (event) => {
+    leave(event);
+    store.stopAll();
+  };
   return html`<header>
     <div class="bar">
-      <a class="home" href="#">zbridge <span class="realm">${store.realm}</span></a>
-      ${store.me.user && html`<span class="empty">${store.me.user} (${store.me.role})
+      <a class="home" href="#">zbridge console</a>
+      <span class="realm">${store.realm}</span>
+      <span class="live ${live ? "good" : "bad"}"><b>${live ? "Live" : "Not connected"}</b></span>
+      ${store.me.user && html`<span class="user">${store.me.user} (${store.me.role})
         <button type="button" onClick=${() => logOut(store.me)}>Log out</button></span>`}
-      ${latched > 0 && store.may("unlatch_fleet") && html`<${Release} store=${store} latched=${latched} />`}
-      <button
-        class="stop-all"
-        type="button"
-        aria-keyshortcuts="Escape"
-        onClick=${(event) => {
-          leave(event);
-          store.stopAll();
-        }}
-      >
-        STOP ALL
-      </button>
+      <button class="stop-all" type="button" aria-keyshortcuts="Escape" onClick=${stopAll}>STOP ALL</button>
     </div>
+    ${latched > 0 && html`<${Latched} store=${store} robots=${counted(latched, "robot")} />`}
     <div class="notices" role="status" aria-live="assertive">
       ${(!store.connected || store.silent) && html`<p class="notice bad">The console does not answer: what is shown is old.</p>`}
       ${store.connected && !store.bus && html`<p class="notice bad">The bus is lost: nothing is known of the robots.</p>`}
@@ -39,22 +35,28 @@ export function Header({ store }) {
 }
 
 function Notice({ notice }) {
-  const tone = notice.good === true ? "good" : notice.good === false ? "bad" : "going";
+  const age = (performance.now() - notice.came) / 1000;
+  if (notice.good === true && age > GOOD_S) return null;
+  const tone = notice.good === true ? "" : notice.good === false ? "bad" : "going";
   const at = new Date(notice.at * 1000).toLocaleTimeString();
-  return html`<p class="notice ${tone}"><time>${at}</time> ${notice.text}</p>`;
+  return html`<p class="notice ${tone}"><time>${at}</time> <span class="empty" aria-hidden="true">${span(age)} ago</span> ${notice.text}
+    ${notice.text.includes(SENT) && html` <b>Sent is not stopped: watch the robots.</b>`}</p>`;
 }
 
-function Release({ store, latched }) {
+// Which robots are latched, and how they are released.
+function Latched({ store, robots }) {
   const [asked, ask] = useState(false);
-  const robots = `${latched} ${latched === 1 ? "robot" : "robots"}`;
-  if (!asked) return html`<button type="button" onClick=${() => ask(true)}>Release</button>`;
-  const release = () => {
-    store.send({ do: "release" });
+  const answer = (yes) => (event) => {
+    leave(event);
+    if (yes) store.send({ do: "release" });
     ask(false);
   };
-  return html`<span class="question">
-    ${robots} may be driven again?
-    <button type="button" class="sure" onClick=${release}>Release</button>
-    <button type="button" onClick=${() => ask(false)}>Cancel</button>
-  </span>`;
+  if (!store.may("unlatch_fleet")) return html`<p class="latched">${robots} latched.</p>`;
+  if (!asked) {
+    return html`<p class="latched">${robots} latched.
+      <button type="button" class="careful" onClick=${() => ask(true)}>Release</button></p>`;
+  }
+  return html`<p class="latched question">Release ${robots}? Programs and people can move them again at once.
+    <button type="button" class="careful" onClick=${answer(true)}>Release ${robots}</button>
+    <button type="button" onClick=${answer(false)}>Keep latched</button></p>`;
 }

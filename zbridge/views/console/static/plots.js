@@ -6,6 +6,8 @@ import { MINUTES_S } from "./robot_data.js";
 const MOST = 8; // lines of one plot
 const HEIGHT = 150;
 const LABEL = 24; // characters of a label
+const BY_POSE = "m/s by its pose";
+const AGES = [-120, -90, -60, -30, 0];
 
 async function loadPlot() {
   const link = Object.assign(document.createElement("link"), { rel: "stylesheet", href: "/static/vendor/uplot.css" });
@@ -19,12 +21,12 @@ export function readValues(data) {
   const current = (path) => (data.isOld(path) || data.away ? null : data.message(path));
   const speed = current("motion")?.speed;
   if (Number.isFinite(speed)) values["speed:% of full scale"] = 100 * speed;
-  else values["speed:m/s by its pose"] = data.away ? null : data.speedByPose();
+  else values[`speed:${BY_POSE}`] = data.away ? null : data.speedByPose();
   const battery = current("battery");
-  if (Number.isFinite(battery?.level)) values["sensors:battery %"] = 100 * battery.level;
+  if (Number.isFinite(battery?.level)) values["sensors:battery (%)"] = 100 * battery.level;
   for (const [name, path] of data.sensors().slice(0, MOST)) {
-    const reading = current(path);
-    values[`sensors:${name}`] = reading && !reading.fault ? reading.value : null;
+    const [reading, kind] = [current(path), data.message(path)?.kind];
+    values[`sensors:${name}${kind ? ` (${kind})` : ""}`] = reading && !reading.fault ? reading.value : null;
   }
   const rates = Object.entries(current("@gateway/stats")?.rates ?? {}).slice(0, MOST);
   for (const [name, rate] of rates) values[`rates:${name}`] = rate;
@@ -58,11 +60,13 @@ function Plot({ name, title, data }) {
   }, [uPlot, shape]);
   useEffect(() => {
     const now = Date.now() / 1000;
-    plot.current?.setData([data.history.at, ...lines.map(([, values]) => values)], false);
-    plot.current?.setScale("x", { min: now - MINUTES_S, max: now });
+    plot.current?.setData([data.history.at.map((at) => at - now), ...lines.map(([, values]) => values)], false);
+    plot.current?.setScale("x", { min: -MINUTES_S, max: 0 });
   });
   if (!labels.length) return null;
-  return html`<section class="panel plot"><h2>${title}</h2><div ref=${box} role="img" aria-label=${`${title}: ${labels.join(", ")}`}></div></section>`;
+  const named = labels.length > 1 ? title : `${title}, ${labels[0]}`;
+  return html`<section class="panel plot ${labels.length > 1 ? "" : "single"}"><h2>${named}</h2>
+    <div ref=${box} role="img" aria-label=${`${title}: ${labels.join(", ")}`}></div></section>`;
 }
 
 function options(labels, width) {
@@ -75,15 +79,18 @@ function options(labels, width) {
     height: HEIGHT,
     cursor: { show: false },
     legend: { live: false },
-    scales: { x: { time: true }, y: { range: (_, low, high) => range(low, high) } },
-    axes: [{ ...axis, size: 28 }, { ...axis, size: 56 }],
+    scales: { x: { time: false }, y: { range: (_, low, high) => range(low, high, leastRange(labels)) } },
+    axes: [{ ...axis, size: 28, splits: AGES, values: AGES.map((age) => (age ? `${-age} s ago` : "now")) }, { ...axis, size: 56 }],
     series: [{}, ...labels.map(line)],
   };
 }
 
-// Includes zero, and never a range of nothing.
-function range(low, high) {
-  const [least, most] = [Math.min(low ?? 0, 0), Math.max(high ?? 1, 0)];
-  const room = Math.max((most - least) * 0.05, 0.01);
-  return [least < 0 ? least - room : 0, most + room];
+// A smaller range would show noise as if it were motion.
+const leastRange = (labels) => (labels.every((label) => label.startsWith("%")) ? 10 : labels.includes(BY_POSE) ? 0.2 : 1);
+
+// Includes zero.
+function range(low, high, least) {
+  const [bottom, top] = [Math.min(low ?? 0, 0), Math.max(high ?? 0, 0)];
+  const room = (top - bottom) * 0.05;
+  return [bottom < 0 ? bottom - room : 0, Math.max(top + room, bottom + least)];
 }

@@ -1,14 +1,13 @@
 // The page of one robot: its picture, its plots, what is known of it, and its stop.
 
 import { html, useEffect, useRef, useState } from "./vendor/htm-preact.js";
-import { leave } from "./header.js";
-import { since, tone } from "./fleet.js";
 import { Drive } from "./drive.js";
 import { DrivePanel } from "./drive_panel.js";
 import { Plots, readValues } from "./plots.js";
 import { Facts, History, Published, Refusals, Sensors, Sessions, Switches, Texts } from "./panels.js";
 import { RobotData } from "./robot_data.js";
 import { Scene } from "./scene.js";
+import { doubtOf, driverOf, leave, span, toneOf, whyOf, wordOf } from "./words.js";
 
 const TICK_MS = 250;
 const WAIT_S = 3; // until what has not come is taken for not published
@@ -26,16 +25,17 @@ export function Robot({ store, name }) {
     </section>`;
   }
   data.away = !PRESENT.includes(row.state) || !store.connected || !store.bus;
-  return html`<section class="robot ${tone(row)}">
-    <${Title} row=${row} store=${store} own=${(data.message("control")?.latches ?? []).some((latch) => !latch.fleet)} />
+  return html`<section class="robot">
+    <${Title} row=${row} store=${store} data=${data} own=${drive?.held} />
+    ${doubtOf(row) && html`<p class="band" role="alert">${doubtOf(row)} Stop may not reach it. Use the emergency stop on the robot.</p>`}
     <div class="columns">
       <div class="views">
         <${Picture} data=${data} />
-        ${drive && html`<${DrivePanel} drive=${drive} row=${row} data=${data} />`}
         <${Camera} data=${data} />
         <${Plots} data=${data} />
       </div>
       <div class="panels">
+        ${drive && html`<${DrivePanel} drive=${drive} row=${row} data=${data} />`}
         <${Facts} row=${row} data=${data} />
         <${Switches} row=${row} data=${data} store=${store} />
         <${Published} data=${data} waited=${performance.now() / 1000 - data.began > WAIT_S} />
@@ -82,32 +82,30 @@ function useDrive(store, name) {
   return drive?.robot === name ? drive : null;
 }
 
-// own: whether a latched stop of this robot alone is in force.
-function Title({ row, store, own }) {
-  const stop = (event) => {
+// own: whether this page drives it.
+function Title({ row, store, data, own }) {
+  const latchedAlone = (data.message("control")?.latches ?? []).some((latch) => !latch.fleet);
+  const ask = (what) => (event) => {
     leave(event);
-    store.send({ do: "stop", robot: row.name });
+    store.send({ do: what, robot: row.name });
   };
-  const unlatch = (event) => {
-    leave(event);
-    store.send({ do: "unlatch", robot: row.name });
-  };
-  const why = [row.seen !== null ? `last seen ${since(row.seen)}` : "", row.reason].filter(Boolean).join("; ");
-  return html`<div class="title">
-    <a href="#" aria-label="All robots">‹ All robots</a>
+  return html`<div class="title ${toneOf(row)}">
+    <a class="back" href="#" aria-label="All robots">‹ All robots</a>
     <h1>${row.name}</h1>
-    <span class="state"><b>${row.state}</b></span>
-    <span class="driver">${driverText(row)}</span>
-    ${own && store.may("unlatch") && html`<button type="button" onClick=${unlatch}>Release ${row.name}</button>`}
-    <button type="button" class="stop" aria-label=${`Stop ${row.name}`} onClick=${stop}>Stop</button>
-    ${why && html`<p class="why">${why}</p>`}
+    <span class="state"><b>${wordOf(row)}</b></span>
+    <span class="driver">${own ? "you drive" : driverText(row)}</span>
+    <span class="acts">
+      ${latchedAlone && store.may("unlatch") && html`<button type="button" class="careful" onClick=${ask("unlatch")}>Release ${row.name}</button>`}
+      <button type="button" class="stop" aria-label=${`Stop ${row.name}`} onClick=${ask("stop")}>Stop</button>
+    </span>
+    <p class="why" tabindex=${whyOf(row) ? 0 : -1}>${whyOf(row)}</p>
   </div>`;
 }
 
 function driverText(row) {
-  if (row.latched.length) return row.latched.join("; ");
-  if (!row.driver) return "nobody drives";
-  return row.driver === "stopped" ? "stopped" : `${row.driver} drives`;
+  const driver = driverOf(row);
+  if (driver === null) return "driver not known";
+  return driver ? `${driver} drives` : "nobody drives";
 }
 
 function Picture({ data }) {
@@ -125,25 +123,31 @@ function Picture({ data }) {
   }, [data]);
   useEffect(() => scene.current.schedule()); // ages, too
   const old = ["map", "scan", "pose"].filter((path) => data.entries.has(path) && (data.isOld(path) || data.away));
-  const ages = old.map((path) => `${path} ${Math.round(data.age(path))} s old`).join(", ");
-  const zoom = (factor) => (event) => {
+  const ages = old.map((path) => `${path} ${span(data.age(path))} old`).join(", ");
+  const view = (change) => (event) => {
     leave(event);
-    scene.current.zoom(factor);
-  };
-  const follow = (event) => {
-    leave(event);
-    scene.current.follow();
+    change(scene.current);
   };
   return html`<section class="panel picture">
     <canvas ref=${canvas} tabindex="0" role="img" aria-label=${`Map, scan and place of ${data.name}${ages ? `; ${ages}` : ""}`}></canvas>
-    ${ages && html`<p class="overlay age">${ages}</p>`}
+    ${ages && html`<p class="overlay age">Not live: ${ages}</p>`}
+    <p class="overlay hint">${hint(data)}</p>
     <p class="overlay scale">${data.poses.length ? "" : "in the robot's own frame; "}grid: ${(scene.current?.scale ?? 40) >= 20 ? 1 : 10} m</p>
     <div class="overlay tools">
-      <button type="button" aria-label="Zoom in" onClick=${zoom(1.25)}>+</button>
-      <button type="button" aria-label="Zoom out" onClick=${zoom(0.8)}>−</button>
-      ${scene.current?.follows === false && html`<button type="button" onClick=${follow}>Follow</button>`}
+      <button type="button" aria-label="Zoom in" onClick=${view((of) => of.zoom(1.25))}>+</button>
+      <button type="button" aria-label="Zoom out" onClick=${view((of) => of.zoom(0.8))}>−</button>
+      <button type="button" onClick=${view((of) => of.fit())}>Fit</button>
+      ${scene.current?.follows === false && html`<button type="button" onClick=${view((of) => of.follow())}>Follow</button>`}
     </div>
   </section>`;
+}
+
+// Why nothing is to be seen around the robot.
+function hint(data) {
+  const [scan, map] = [data.message("scan"), data.message("map")];
+  if (!scan && !map?.cells.length) return "No map and no scan received.";
+  const near = scan?.ranges.some((range) => range >= scan.range_min && range < scan.range_max);
+  return scan && !near && !data.isOld("scan") ? `The scanner sees nothing within ${scan.range_max.toFixed(0)} m.` : "";
 }
 
 function Camera({ data }) {
@@ -162,6 +166,6 @@ function Camera({ data }) {
   return html`<section class="panel camera ${old ? "old" : ""}">
     ${shown.broken && html`<p class="empty">What the camera sent is no picture.</p>`}
     ${!shown.broken && shown.address && html`<img src=${shown.address} alt=${`Camera of ${data.name}`} onError=${broken} />`}
-    ${old && html`<p class="overlay age">picture ${Math.round(data.age("image"))} s old</p>`}
+    ${old && html`<p class="overlay age">Not live: picture ${span(data.age("image"))} old</p>`}
   </section>`;
 }

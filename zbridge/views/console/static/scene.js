@@ -16,6 +16,7 @@ export class Scene {
     this.centre = { x: 0, y: 0 };
     this.follows = true;
     this.pointers = new Map();
+    this.points = []; // of the scan that is drawn, metres
     this.map = { message: null, old: null, image: null };
     this.scheduled = 0;
     this.moved = () => {}; // called when somebody moves the picture
@@ -111,6 +112,23 @@ export class Scene {
     this.setFollows(true);
   }
 
+  // Shows all that is drawn, and a little more.
+  fit() {
+    const map = this.data.message("map");
+    const all = [...this.points, ...[...this.data.trail, ...this.data.poses.slice(-1)].map(({ x, y }) => [x, y])];
+    if (map?.cells.length) {
+      const [x, y] = map.origin;
+      all.push([x, y], [x + map.columns * map.cell, y + map.rows * map.cell]);
+    }
+    if (!all.length) return;
+    const sides = [0, 1].map((axis) => all.map((place) => place[axis])).map((values) => [Math.min(...values), Math.max(...values)]);
+    const [across, along] = sides.map(([low, high]) => high - low + 2 * ROBOT_M);
+    const [wide, high] = this.ownFrame ? [along, across] : [across, along];
+    this.centre = { x: (sides[0][0] + sides[0][1]) / 2, y: (sides[1][0] + sides[1][1]) / 2 };
+    this.setFollows(false);
+    this.scale = Math.min(LARGEST, Math.max(SMALLEST, 0.95 * Math.min(this.canvas.clientWidth / wide, this.canvas.clientHeight / high)));
+  }
+
   setFollows(follows) {
     this.follows = follows;
     this.moved();
@@ -146,8 +164,8 @@ export class Scene {
     if (this.follows) this.centre = pose ? { x: pose.x, y: pose.y } : { x: 0, y: 0 };
     const view = this.matrix(width, height, ratio);
     context.setTransform(...view);
-    this.drawGrid(context, width, height);
     this.drawMap(context);
+    this.drawGrid(context, width, height);
     this.drawTrail(context);
     this.drawScan(context, view, ratio);
     this.drawRobot(context, pose);
@@ -209,6 +227,7 @@ export class Scene {
   // Points are whole pixels: they stay sharp, whatever the zoom.
   drawScan(context, view, ratio) {
     const scan = this.data.message("scan");
+    this.points = [];
     if (!scan) return;
     const pose = this.data.poseAt(scan.stamp_ns) ?? { x: 0, y: 0, heading: 0 };
     const side = Math.round(3 * ratio);
@@ -218,6 +237,7 @@ export class Scene {
       if (!(range >= scan.range_min && range < scan.range_max)) return; // at the end of the range nothing was seen
       const angle = pose.heading + scan.angle_min + index * scan.angle_increment;
       const [x, y] = [pose.x + range * Math.cos(angle), pose.y + range * Math.sin(angle)];
+      this.points.push([x, y]);
       const [right, down] = [view[0] * x + view[2] * y + view[4], view[1] * x + view[3] * y + view[5]];
       context.fillRect(Math.round(right - side / 2), Math.round(down - side / 2), side, side);
     });

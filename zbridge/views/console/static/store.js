@@ -103,14 +103,23 @@ export class Store {
     this.known = this.known || Boolean(message.full);
     if (message.notices?.all) this.clearUnanswered();
     if (message.me) this.me = { ...this.me, ...message.me };
-    if (message.warning) this.warning = { text: message.warning, at: Date.now() / 1000, good: false };
+    if (message.warning) this.warning = noticed({ text: message.warning, at: Date.now() / 1000, good: false });
     for (const row of message.rows ?? []) this.rows.set(row.name, row);
     for (const name of message.gone ?? []) {
       this.rows.delete(name);
       this.rates.delete(name);
     }
-    for (const name of ["realm", "bus", "notices", "fault"]) if (name in message) this[name] = message[name];
+    for (const name of ["realm", "bus", "fault"]) if (name in message) this[name] = message[name];
+    if (message.notices) this.takeNotices(message.notices);
     this.changed();
+  }
+
+  takeNotices(notices) {
+    for (const [of, notice] of Object.entries(notices)) {
+      const before = this.notices[of];
+      notices[of] = notice.at === before?.at && notice.text === before.text ? before : noticed(notice);
+    }
+    this.notices = notices;
   }
 
   sample() {
@@ -120,7 +129,7 @@ export class Store {
       if (rates.length > KEPT) rates.shift();
       this.rates.set(name, rates);
     }
-    if (this.silent) this.changed();
+    this.changed(); // ages
   }
 
   send(request) {
@@ -148,7 +157,10 @@ export class Store {
   }
 
   warn(text) {
-    this.notices = { all: { text, at: Date.now() / 1000, good: false } };
+    this.notices = { all: noticed({ text, at: Date.now() / 1000, good: false }) };
     this.changed();
   }
 }
+
+// A notice, and when it came by the page's own clock.
+const noticed = (notice) => ({ ...notice, came: performance.now() });

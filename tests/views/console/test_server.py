@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gzip
 import json
 import socket
 from collections.abc import Callable
@@ -25,6 +26,7 @@ from zbridge.protocol.address import Address
 from zbridge.views.console import console, orders, page, server
 from zbridge.views.console.http_server import listener
 
+STATIC = Path(server.__file__).parent / "static"
 CONFIRMED = "stopped (their gateways sent it)"
 
 
@@ -216,6 +218,12 @@ async def test_every_answer_forbids_what_a_page_of_ours_does_not_need(scene: Sce
         assert "default-src 'none'" in policy
         assert "unsafe" not in policy
         assert (headers["x-content-type-options"], headers["cache-control"]) == ("nosniff", "no-cache")
+
+
+def test_the_pages_are_small() -> None:
+    files = [path.read_bytes() for path in STATIC.rglob("*") if path.is_file()]
+    assert sum(map(len, files)) <= 200_000
+    assert sum(len(gzip.compress(content)) for content in files) <= 80_000
 
 
 async def test_files_beside_the_pages_are_not_served(scene: Scene) -> None:

@@ -29,6 +29,8 @@ from zbridge.views.console.rights import Action, Caller
 BODY_BYTES = 4096
 BODY_S = 10.0
 """Longest time that the body of a request may take."""
+REFUSED_S = 0.1
+"""How long a refused login waits for its answer."""
 STREAM_S = 2.0
 """Longest wait for the next message of a stream."""
 _encode = msgspec.json.Encoder(enc_hook=lambda array: array.tolist()).encode
@@ -121,6 +123,7 @@ class Api:
             secret, caller = await console.callers.log_in(body.user, body.password, caller.address)
         except Refused as refusal:
             console.journal.note(msgspec.structs.replace(caller, user=body.user), "login", result=f"refused: {refusal}")
+            await asyncio.sleep(REFUSED_S)  # who tries passwords must not delay who drives
             return problem(refusal_status(refusal), str(refusal))
         console.journal.note(caller, "login", result="ok")
         return answered(self._me(caller), cookie=console.callers.cookie(secret))

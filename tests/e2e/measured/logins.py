@@ -2,8 +2,8 @@
 
     python -m tests.e2e.measured.logins
 
-Judged at the socket of a scripted robot, from the moment when the page sends a motion; the page is a socket that answers
-ticks as the browser's page does. The passwords are tried by a process of its own.
+Judged at the socket of a scripted robot, from the moment when the page sends a motion. The page is a socket that
+answers ticks as a browser does. The passwords are tried by a process of its own.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ async def latencies(page: Page, robot: Robot) -> list[float]:
         begun = time.monotonic()
         await page.drive(0.5)
         async with asyncio.timeout(10):
-            while not (moved := [f.at for f in tuple(robot.frames)[-50:] if f.moves and f.at > begun]):
+            while not (moved := [f.at for f in tuple(robot.frames)[-50:] if f.moves and f.at > begun]):  # noqa: ASYNC110
                 await asyncio.sleep(0.0005)
         found.append(moved[0] - begun)
         await page.drive(0.0)
@@ -117,17 +117,16 @@ async def try_passwords(at: str) -> None:
 async def measure() -> bool:
     async with driven() as (page, robot, at):
         quiet = await latencies(page, robot)
-        attacker = subprocess.Popen(
-            [sys.executable, "-m", "tests.e2e.measured.logins", at], cwd=ROOT, stdout=subprocess.PIPE, text=True
-        )
+        command = (sys.executable, "-m", "tests.e2e.measured.logins", at)
+        attacker = await asyncio.create_subprocess_exec(*command, cwd=ROOT, stdout=subprocess.PIPE)
         try:
             assert attacker.stdout is not None
-            begun = asyncio.create_task(asyncio.to_thread(attacker.stdout.readline))
+            begun = asyncio.create_task(attacker.stdout.readline())
             attacked = await latencies(page, robot)
-            first = await begun
+            first = (await begun).decode()
         finally:
             attacker.kill()
-            attacker.wait()
+            await attacker.wait()
         assert page.control["state"] == "held"
     p99 = [1000 * times[len(times) * 99 // 100] for times in (quiet, attacked)]
     middle = [1000 * times[len(times) // 2] for times in (quiet, attacked)]

@@ -10,6 +10,8 @@ USUAL_HZ = 2000
 SECONDS, QUIET_S = 2.0, 0.5
 ANSWER_S = 2.0
 """Longest wait for an answer, and of commands, on a busy machine; without filters it is four seconds, or for ever."""
+OBEYED = 0.5
+"""Least share of the holder's drives that arrive, on a busy machine: what waits longer than 0.3 s is dropped."""
 GROWN_MB = 20.0
 
 
@@ -26,7 +28,7 @@ def test_a_flood_moves_no_robot_keeps_nobody_waiting_and_costs_no_memory(kind: s
         assert row.stopped_s < 0.5
         assert row.last_motion_s is None or row.last_motion_s < row.stopped_s, "at rest, and it stays so"
     else:
-        assert row.flooded.arrived > 0.9, "the holder is obeyed"
+        assert row.flooded.arrived > OBEYED, "the holder is obeyed"
         assert row.flooded.median_us < ANSWER_S * 1e6
     assert row.answer_s < ANSWER_S
     assert row.after_mb - row.before_mb < GROWN_MB

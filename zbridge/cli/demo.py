@@ -135,9 +135,8 @@ async def run_demo(seconds: float, *, secure: bool = False, console: bool = Fals
             *(f"  {name}: {_how_to_connect(find_protocol(robots[name]), listeners[name])}" for name in watch.rows),
         ]
         if _has_console():
-            options, login = _console_users(folder) if secure else ((), "")
-            serving = _console(folder, log, (*bus.joins, *options), opens=console)
-            how.append(f"the fleet in a browser, with STOP ALL: {await stack.enter_async_context(serving)}{login}")
+            serving = _console(folder, log, bus.joins, secure=secure, opens=console)
+            how.append(f"the fleet in a browser, with STOP ALL: {await stack.enter_async_context(serving)}")
         await until_signal(_show(bus.operator, watch, seconds, how))
         await end([gateway for _, gateway in processes])  # all at once: each needs about a second to stop its robot
         await end([simulator for simulator, _ in processes])
@@ -166,13 +165,16 @@ def _console_users(folder: Path) -> tuple[tuple[str, ...], str]:
 
 
 @contextlib.asynccontextmanager
-async def _console(folder: Path, log: IO[bytes], more: tuple[str, ...], *, opens: bool) -> AsyncIterator[str]:
-    """Run the console while the context lasts; yield its address, or why it has none.
+async def _console(
+    folder: Path, log: IO[bytes], joins: tuple[str, ...], *, secure: bool, opens: bool
+) -> AsyncIterator[str]:
+    """Run the console while the context lasts; yield its address and how to log in, or why it has no address.
 
-    more: the options by which it joins the bus, and others. opens: whether to open it in a browser.
+    joins: the options by which it joins the bus. opens: whether to open it in a browser.
     """
-    options = ("--listen", "127.0.0.1:0", "--roster", str(folder / "roster"))
-    async with process(log, "console", *options, *more, read=True) as console:
+    users, login = _console_users(folder) if secure else ((), "")
+    options = ("--listen", "127.0.0.1:0", "--roster", str(folder / "roster"), *joins, *users)
+    async with process(log, "console", *options, read=True) as console:
         assert console.stdout is not None
         line = b""
         with contextlib.suppress(TimeoutError):
@@ -181,7 +183,7 @@ async def _console(folder: Path, log: IO[bytes], more: tuple[str, ...], *, opens
         at = line.decode().rpartition(" ")[2].strip()
         if opens and at:
             webbrowser.open(at)
-        yield at or "it did not start"
+        yield at + login if at else "it did not start"
 
 
 def _left_out(error: ZbridgeError) -> str:

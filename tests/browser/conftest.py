@@ -80,6 +80,11 @@ class Browser:
             self.complaints.append(text)
 
 
+def told(action: str, text: str, *, good: bool | None) -> dict[str, Any]:
+    """A notice of the console's, of now."""
+    return {"action": action, "text": text, "at": time.time(), "good": good}
+
+
 class Feed:
     """Plays the console's server to one page: what it says, and what it was asked for."""
 
@@ -95,11 +100,11 @@ class Feed:
     def __call__(self, socket: Any) -> None:
         self._socket, self.quiet = socket, False
         socket.on_message(lambda text: self.asked.append(json.loads(text)))
-        socket.send(json.dumps({**self._begin, "rows": self._rows}))
+        socket.send(json.dumps({"now": time.time(), **self._begin, "rows": self._rows}))
         self._alive = asyncio.get_running_loop().create_task(self._stay_alive())
 
     def tell(self, **message: Any) -> None:
-        self._socket.send(json.dumps(message))
+        self._socket.send(json.dumps({"now": time.time(), **message}))
 
     def publish(
         self, robot: str, *, period_s: float = 1.0, age_s: float = 0.0, late_s: float = 0.0, **messages: Any

@@ -40,6 +40,14 @@ class Lane:
     def __init__(self, world: World, browser: Browser) -> None:
         self.world, self.browser = world, browser
         self.robot: Gateway = world.gateways["r1"]
+        self.commands = COMMANDS
+        """What the robot accepts."""
+
+    async def publish_status(self) -> None:
+        """Publish the robot's status as a gateway does."""
+        while True:
+            self.robot.publish(topics.STATUS, Status("established", commands=self.commands))
+            await asyncio.sleep(0.5)
 
     async def page(self, **options: Any) -> Any:
         page = await self.browser.open(ROBOT, **options)
@@ -73,19 +81,12 @@ class Lane:
         assert not [drive for drive in self.robot.driven[count:] if drive.moving]  # type: ignore[attr-defined]
 
 
-async def publish_status(world: World) -> None:
-    """Publish the robot's status as a gateway does."""
-    while True:
-        world.gateway.publish(topics.STATUS, Status("established", commands=COMMANDS))
-        await asyncio.sleep(0.5)
-
-
 @pytest_asyncio.fixture(loop_scope="session")
 async def lane(tmp_path: Path, shared: Any) -> AsyncIterator[Lane]:
     world = World("r1")
-    publishing = asyncio.create_task(publish_status(world))
     async with served(world.fleet, world.bus.join("console"), tmp_path / "roster") as at:
         made = Lane(world, Browser(shared, at))
+        publishing = asyncio.create_task(made.publish_status())
         yield made
         assert made.browser.complaints == []
     publishing.cancel()
@@ -145,6 +146,43 @@ async def test_space_stops_the_robot_and_clicks_no_button_again(lane: Lane) -> N
     await page.get_by_text("the lease has ended").wait_for()
     await lane.stays()
     assert await page.get_by_role("button", name="Take control").count() == 1
+
+
+async def test_space_stops_wherever_the_focus_is_and_once_for_each_press(lane: Lane) -> None:
+    page = await lane.driver()
+    await page.get_by_role("slider").focus()
+    stops = lane.robot.machine.stops
+    await page.evaluate("dispatchEvent(new KeyboardEvent('keydown', {code: 'Space', repeat: true}))")
+    await page.wait_for_timeout(200)
+    assert lane.robot.machine.stops == stops
+    await page.keyboard.press("Space")
+    await soon(lambda: lane.robot.machine.stops > stops)
+
+
+@pytest.mark.parametrize(
+    "event", ["new MouseEvent('contextmenu')", "new Event('dragstart')", "new KeyboardEvent('keydown', {key: 'Meta'})"]
+)
+async def test_a_key_whose_release_the_page_may_not_hear_counts_no_longer(lane: Lane, event: str) -> None:
+    page = await lane.driver()
+    await page.keyboard.down("w")
+    await lane.moves()
+    await page.evaluate(f"dispatchEvent({event})")
+    await lane.stays()
+
+
+async def test_a_stick_that_vanishes_while_it_is_dragged_is_let_go(lane: Lane) -> None:
+    page = await lane.driver()
+    box = await page.get_by_label("Stick: drag to drive").bounding_box()
+    await page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    await page.mouse.down()
+    await page.mouse.move(box["x"] + box["width"] / 2, box["y"])
+    await lane.moves()
+    lane.commands = ("stop", "motor")
+    await page.get_by_label("Stick: drag to drive").wait_for(state="detached")
+    lane.commands = COMMANDS
+    await page.get_by_label("Stick: drag to drive").wait_for()
+    await lane.stays()
+    await page.mouse.up()
 
 
 async def test_the_stick_on_the_page_is_dragged_by_mouse_and_let_go(lane: Lane) -> None:
@@ -494,7 +532,14 @@ async def test_modes_and_motors_are_there_for_what_the_robot_accepts(lane: Lane)
     await page.get_by_text("r1 then moves by itself.").wait_for()
     assert ("mode", Mode("autonomous")) not in lane.robot.machine.commands
     await page.get_by_role("button", name="Set autonomous").click()
-    await soon(lambda: ("mode", Mode("autonomous")) in lane.robot.machine.commands)
+    await page.get_by_role("button", name="autonomous", pressed=True).wait_for()
+    await asyncio.sleep(0.5)
+    assert lane.robot.machine.commands[-1] == ("mode", Mode("autonomous"))
+    await page.evaluate("document.hasFocus = () => false")
+    await page.get_by_role("button", name="none", pressed=True).wait_for()
+    await page.evaluate("document.hasFocus = () => true")
+    assert {("drive", Drive()), ("mode", Mode("none"))} <= set(lane.robot.machine.commands[-3:])
+    await page.get_by_text("Ready.").wait_for()
     await page.get_by_text("Single motors").click()
     button = page.get_by_role("button", name="left wheel forwards")
     await button.hover()

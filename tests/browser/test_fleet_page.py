@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from tests.browser.conftest import NARROW, WIDE, Browser, Feed, row, soon
+from tests.browser.conftest import NARROW, WIDE, Browser, Feed, row, soon, told
 
 pytestmark = pytest.mark.asyncio(loop_scope="session")
 
@@ -132,23 +132,94 @@ async def test_one_robot_is_stopped_or_forgotten_by_its_row(browser: Browser) ->
     assert feed.asked == [{"do": "stop", "robot": "free"}, {"do": "forget", "robot": "killed"}]
 
 
-async def test_a_console_that_does_not_answer_is_said_and_a_stop_is_sent_when_it_does_again(browser: Browser) -> None:
-    feed = Feed(row("r1"))
+async def cut_off(browser: Browser, **more: Any) -> tuple[Any, Feed]:
+    """Open the page of a console that does not answer any more."""
+    feed = Feed(row("r1"), **more)
     page = await browser.open(feed=feed)
     await page.locator(".tall .row").first.wait_for()
     await page.evaluate(NOBODY_ANSWERS)
     await feed.close()
     await page.get_by_text("does not answer: what is shown is old").wait_for()
-    await page.keyboard.press("Escape")
-    await page.get_by_text("STOP ALL was NOT sent").wait_for()
+    return page, feed
+
+
+@pytest.mark.parametrize(
+    ("robot", "said", "asked"),
+    [
+        ("", "STOP ALL was NOT sent", {"do": "stop_all"}),
+        ("r1", "r1: the stop was NOT sent", {"do": "stop", "robot": "r1"}),
+    ],
+)
+async def test_a_stop_that_was_not_sent_is_said_until_it_is_answered_and_sent_when_the_console_is_back(
+    browser: Browser, robot: str, said: str, asked: dict[str, str]
+) -> None:
+    old = told(asked["do"], "of an earlier stop", good=True)
+    page, feed = await cut_off(browser, notices={robot: old})
+    await page.get_by_role("button", name=f"Stop {robot}" if robot else "STOP ALL", exact=True).click()
+    await page.get_by_text(said).wait_for()
     assert feed.asked == []
     await page.evaluate("() => { WebSocket = window.Real; }")
     await soon(lambda: feed.asked)
-    assert feed.asked == [{"do": "stop_all"}]
+    assert feed.asked == [asked]
+    await page.get_by_text("Live").wait_for()
+    assert await page.get_by_text(said).count() == 1, "the notice of an earlier stop is no answer"
+    feed.tell(notices={robot: told(asked["do"], "done", good=True)})
+    await page.get_by_text("done").wait_for()
+    await page.get_by_text(said).wait_for(state="detached")
+    await page.wait_for_timeout(1700)
+    assert await page.get_by_text("has not answered").count() == 0
+
+
+async def test_a_stop_without_an_answer_is_said_and_one_that_a_cut_swallowed_is_sent_again(browser: Browser) -> None:
+    feed = Feed(row("r1"))
+    page = await browser.open(feed=feed)
+    await page.get_by_role("button", name="Stop r1").click()
+    await page.get_by_text("r1: the stop was sent, and the console has not answered yet").wait_for()
+    await page.keyboard.press("Escape")
+    await soon(lambda: {"do": "stop_all"} in feed.asked)
+    count = len(feed.asked)
+    await feed.close()
+    await soon(lambda: len(feed.asked) > count + 1)
+    assert feed.asked[count:] == [{"do": "stop", "robot": "r1"}, {"do": "stop_all"}]
+    assert await page.get_by_text("STOP ALL was NOT confirmed").count() == 1
+
+
+async def test_what_a_person_asks_for_is_not_lost_in_silence(browser: Browser) -> None:
+    feed = Feed(row("r1", "LATCHED", 8, latched=["latched"]))
+    page = await browser.open(feed=feed)
+    await page.get_by_role("button", name="Release").click()
+    await page.evaluate(NOBODY_ANSWERS)
+    await feed.close()
+    await page.get_by_text("does not answer: what is shown is old").wait_for()
+    await page.get_by_role("button", name="Release 1 robot").click()
+    await page.get_by_text("release was NOT sent: the console does not answer.").wait_for()
+
+
+async def test_the_age_of_a_notice_is_by_the_consoles_clock(browser: Browser) -> None:
+    page = await browser.open(
+        feed=Feed(row("r1"), now=1000.0, notices={"r1": {**told("stop", "r1 away", good=False), "at": 970.0}})
+    )
+    await page.get_by_text("30 s ago").wait_for()
+
+
+async def test_escape_stops_though_a_control_keeps_its_keys_to_itself(browser: Browser) -> None:
+    feed = Feed(row("r1"))
+    page = await browser.open(feed=feed)
+    await page.get_by_label("Filter robots").evaluate(
+        "(field) => field.addEventListener('keydown', (event) => event.stopPropagation())"
+    )
+    await page.get_by_label("Filter robots").press("Escape")
+    await soon(lambda: feed.asked == [{"do": "stop_all"}])
+
+
+async def test_an_address_that_is_cut_off_is_the_fleet(browser: Browser) -> None:
+    page = await browser.open("/#/robot/%", feed=Feed(row("r1")))
+    await page.locator(".tall .row").first.wait_for()
+    assert browser.complaints == []
 
 
 async def test_a_notice_is_read_out_and_hostile_text_stays_text(browser: Browser) -> None:
-    feed = Feed(row("r1"), notices={"all": {"text": EVIL, "at": 1_700_000_000, "good": False}})
+    feed = Feed(row("r1"), notices={"": {"action": "release", "text": EVIL, "at": 1_700_000_000, "good": False}})
     page = await browser.open(feed=feed)
     status = page.get_by_role("status")
     await status.get_by_text(EVIL).wait_for()
@@ -159,11 +230,11 @@ async def test_a_notice_is_read_out_and_hostile_text_stays_text(browser: Browser
 
 
 async def test_a_confirmed_stop_tells_to_watch_the_robots_and_its_notice_ends_by_itself(browser: Browser) -> None:
-    good = {"text": "1 of 1 stopped (their gateways sent it)", "at": 1_700_000_000, "good": True}
-    feed = Feed(row("r1"), notices={"all": good})
+    good = told("stop_all", "1 of 1 stopped (their gateways sent it)", good=True)
+    feed = Feed(row("r1"), notices={"": good})
     page = await browser.open(feed=feed)
     await page.get_by_text("Sent is not stopped: watch the robots.").wait_for()
-    feed.tell(notices={"all": good, "one": {"text": "r1 is not confirmed", "at": 1_700_000_000, "good": False}})
+    feed.tell(notices={"": good, "r1": told("stop", "r1 is not confirmed", good=False)})
     await page.get_by_text("r1 is not confirmed").wait_for()
     await page.evaluate(
         "() => { const now = performance.now.bind(performance); performance.now = () => now() + 61000; }"

@@ -11,7 +11,7 @@ from typing import Any
 import msgpack
 import pytest
 
-from tests.browser.conftest import NARROW, WIDE, Browser, Feed, row, soon
+from tests.browser.conftest import NARROW, WIDE, Browser, Feed, row, soon, told
 from tests.browser.scene import middle, places
 from tests.browser.test_fleet_page import EVIL, NOBODY_ANSWERS
 
@@ -382,15 +382,36 @@ async def test_a_console_that_hangs_is_not_taken_for_present_and_a_stop_without_
     page, feed = await opened(browser)
     feed.quiet = True
     await page.keyboard.press("Escape")
-    await page.get_by_text("STOP ALL: the console has not answered yet").wait_for()
+    await page.get_by_text("STOP ALL was sent, and the console has not answered yet").wait_for()
     await page.evaluate(
         "() => { const now = performance.now.bind(performance); performance.now = () => now() + 7000; }"
     )
     await page.get_by_text("The console does not answer").wait_for()
-    feed.tell(notices={"all": {"text": "1 of 1 stopped", "at": time.time(), "good": True}})
+    feed.tell(notices={"": told("stop_all", "1 of 1 stopped", good=True)})
     await page.get_by_text("1 of 1 stopped").wait_for()
     await page.wait_for_timeout(2000)
     assert await page.get_by_text("1 of 1 stopped").count() == 1
+
+
+async def test_what_is_shown_is_old_while_the_console_says_nothing(browser: Browser) -> None:
+    page, feed = await opened(browser)
+    feed.publish("r1", map=MAP, pose=POSE)
+    await page.locator("canvas").first.wait_for()
+    feed.quiet = True
+    await page.evaluate(
+        "() => { const now = performance.now.bind(performance); performance.now = () => now() + 4000; }"
+    )
+    await page.get_by_text("Not live").first.wait_for()
+
+
+async def test_after_another_console_nothing_of_the_one_before_has_an_age(browser: Browser) -> None:
+    """The console's machine was restarted: its clock begins anew."""
+    page, feed = await opened(browser)
+    feed.publish("r1", scan=SCAN, pose=POSE, period_s=0.1)
+    await page.get_by_label(re.compile("Map, scan and place")).wait_for()
+    await feed.close()
+    await feed.looked_at("r1")
+    await page.get_by_text("No map and no scan received.").wait_for()
 
 
 VALUES: tuple[Any, ...] = (

@@ -41,14 +41,13 @@ class Page:
         """Ask for something; give the sentence that comes of it."""
         before = time.time()
         self._opened.send(json.dumps({"do": do, "robot": robot}))
-        of = "one" if robot else "all"
 
         def known() -> bool:
-            notice = self.notices.get(of, {})
+            notice = self.notices.get(robot, {})
             return notice.get("good") is not None and notice["at"] > before
 
         self.until(known, f"what came of {do}")
-        return str(self.notices[of]["text"])
+        return str(self.notices[robot]["text"])
 
     def states(self) -> dict[str, str]:
         return {name: row["state"] for name, row in self.rows.items()}

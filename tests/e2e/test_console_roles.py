@@ -46,7 +46,7 @@ class Scene(Programs):
                     if "warning" in told:
                         assert re.search("may not|does not permit", told["warning"])
                         return False
-                    if told.get("gone") == [GHOST] or (told.get("notices", {}).get("one") or {}).get("good"):
+                    if told.get("gone") == [GHOST] or any(each["good"] for each in told.get("notices", {}).values()):
                         return True
 
     async def takes(self, user: str, *, takeover: bool) -> bool:

@@ -148,7 +148,8 @@ class Fleet:
         """Send a prepared stop, for callers that need its id or its sender's name; return as :meth:`stop` does."""
         if names is None:
             await stops.put_stop(self._bus, KeySpace(self.realm, "*"), stop)
-            names = {*filter(is_name, await settled(self._gateways, lambda seen: seen)), *also}
+            names = {*filter(is_name, await settled(self._gateways, lambda seen: seen))}
+            return await stops.stop_robots(self._bus, self.realm, names, stop, absent={*also} - names)
         names = [names] if isinstance(names, str) else names
         return await stops.stop_robots(self._bus, self.realm, names, stop)
 

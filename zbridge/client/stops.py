@@ -11,8 +11,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
-from collections import Counter
-from collections.abc import Awaitable, Callable, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
+from itertools import islice
 from typing import TypeVar
 
 import msgspec
@@ -23,7 +23,7 @@ from zbridge.errors import BusError, NotReady, PayloadError, Refused, refusal
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, Latch, Refusal, Status, Stop, Unlatch
-from zbridge.fleet.topics import KeySpace, Topic
+from zbridge.fleet.topics import KeySpace, Topic, split_key
 
 REPEAT_S = 0.25
 """Seconds between two repetitions of a stop that is not confirmed."""
@@ -35,7 +35,7 @@ AT_ONCE = 64
 """Most robots whose confirmations are awaited at a time."""
 _APART_S = 0.1
 """Seconds after which a gateway does not treat a repeated stop as a repetition."""
-_NAMED = 20
+NAMED = 20
 """Most robots that a finding names."""
 _WHO, _REASON = 64, 100
 """Characters that fit into a stop, with room for non-ASCII ones."""
@@ -79,7 +79,7 @@ async def stop_robot(bus: Bus, keys: KeySpace, stop: Stop) -> None:
     await put_stop(bus, keys, stop)  # before anything that may take time
     control = await _shown(bus, keys, stop, lambda control: stop.id in control.stops, CONFIRM_S)
     if control is None:
-        raise BusError(f"{keys.robot}: stop sent, but no gateway confirmed it within {CONFIRM_S:g} s")
+        raise _unconfirmed(keys.robot)
     if count := _stops_refused(control):  # of this stop, or of an earlier one: the next report shows which
         await asyncio.sleep(_APART_S)
         control = await _shown(bus, keys, stop, lambda control: _stops_refused(control) > count, REPEAT_S)
@@ -99,9 +99,40 @@ async def stop_robot(bus: Bus, keys: KeySpace, stop: Stop) -> None:
         raise StopWaits(f"{keys.robot}: stop accepted, but it waits: the robot's link is stalled")
 
 
-async def stop_robots(bus: Bus, realm: str, robots: Iterable[str], stop: Stop) -> dict[str, Outcome]:
-    """Stop robots, a limited number at a time; return the outcome for each."""
-    return await _each(robots, lambda robot: stop_robot(bus, KeySpace(realm, robot), stop))
+async def stop_robots(
+    bus: Bus, realm: str, robots: Iterable[str], stop: Stop, *, absent: Iterable[str] = ()
+) -> dict[str, Outcome]:
+    """Stop robots, a limited number at a time; return the outcome for each.
+
+    absent: robots that have no gateway now. They share one wait, so that none of the others waits for them.
+    """
+    stopped, missed = await asyncio.gather(
+        _each(robots, lambda robot: stop_robot(bus, KeySpace(realm, robot), stop)),
+        _stop_absent(bus, realm, absent, stop),
+    )
+    return dict(sorted((missed | stopped).items()))
+
+
+async def _stop_absent(bus: Bus, realm: str, robots: Iterable[str], stop: Stop) -> dict[str, Outcome]:
+    """Stop those of these robots that get a gateway within CONFIRM_S."""
+    outcomes: dict[str, Outcome] = {robot: _unconfirmed(robot) for robot in robots}
+    begun: dict[str, asyncio.Task[dict[str, Outcome]]] = {}
+
+    def begin(sample: Sample) -> None:
+        split = split_key(sample.key)
+        if split is not None and split[1] in outcomes and split[1] not in begun:
+            begun[split[1]] = asyncio.create_task(stop_robots(bus, realm, [split[1]], stop))
+
+    try:
+        if outcomes:
+            with contextlib.closing(bus.subscribe(KeySpace(realm, "*").key(topics.CONTROL.path), begin, history=True)):
+                await asyncio.sleep(CONFIRM_S)
+        for stopped in await asyncio.gather(*begun.values()):
+            outcomes |= stopped
+    finally:
+        for task in begun.values():
+            task.cancel()
+    return outcomes
 
 
 async def unlatch_robot(bus: Bus, keys: KeySpace, name: str) -> tuple[Latch, ...]:
@@ -140,11 +171,16 @@ def summarize(outcomes: Mapping[str, Outcome], done: str) -> str:
     """Sum up in one line: ``38 of 40 stopped; r7 offline; r9 did not confirm``."""
     findings = {name: finding(error) for name, error in outcomes.items() if error is not None}
     parts = [f"{len(outcomes) - len(findings)} of {len(outcomes)} {done}"]
-    for word, count in Counter(findings.values()).items():
+    for word in dict.fromkeys(findings.values()):
         names = [name for name, found in findings.items() if found == word]
-        more = f" and {count - _NAMED} more" if count > _NAMED else ""
-        parts.append(f"{', '.join(names[:_NAMED])}{more} {word}")
+        parts.append(f"{listed(names)} {word}")
     return "; ".join(parts)
+
+
+def listed(names: Collection[str]) -> str:
+    """Name some robots, and say how many more there are."""
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(islice(names, NAMED)) + more
 
 
 def finding(error: Exception) -> str:
@@ -232,6 +268,10 @@ async def _last(
                 if broken:
                     raise
     return None
+
+
+def _unconfirmed(robot: str) -> BusError:
+    return BusError(f"{robot}: stop sent, but no gateway confirmed it within {CONFIRM_S:g} s")
 
 
 def _refused_stops(control: Control) -> list[Refusal]:

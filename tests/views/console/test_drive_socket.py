@@ -18,7 +18,7 @@ from tests.client import Gateway
 from tests.views.console.conftest import Scene
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Mode, Motor, Status
-from zbridge.views.console import console, seats
+from zbridge.views.console import console, drive_link, seats
 from zbridge.views.console.drive_link import BRIDGE_S, FRESH_S, GAP_S
 from zbridge.views.console.seats import RELOAD_S
 
@@ -287,6 +287,54 @@ async def test_regained_focus_and_changed_gamepads_need_neutral(scene: Scene, ro
         await driver.until(lambda control: control["needs"] is not None)
         await rests(robot)
         assert robot.driven[-1] == Drive()
+
+
+async def by_itself(scene: Scene, driver: Driver) -> Gateway:
+    """Have a robot move by itself for a while; its page repeats neutral meanwhile."""
+    robot = scene.world.gateways["r1"]
+    await driver.take()
+    await driver.say(do="mode", mode="autonomous")
+    await driver.until(lambda control: control["mode"] == "autonomous")
+    await asyncio.sleep(1.0)
+    assert robot.machine.commands[-1] == ("mode", Mode("autonomous")), "neutral would end it"
+    assert driver.control["mode"] == "autonomous"
+    return robot
+
+
+@pytest.mark.parametrize("ended_by", ["motion", "focus", "silence", "mode", "close"])
+async def test_a_robot_moves_by_itself_while_its_page_is_there_and_neutral(
+    scene: Scene, robot: Gateway, ended_by: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in {"BRIDGE_S": 1.0, "FRESH_S": 1.5, "GAP_S": 1.5}.items():  # a busy machine is no silence
+        monkeypatch.setattr(drive_link, name, value)
+    async with opened(scene) as driver:
+        await by_itself(scene, driver)
+        if ended_by == "motion":
+            await driver.drive(0.5)
+            await driver.until(lambda control: control["needs"] == "the mode was autonomous")
+        elif ended_by == "focus":
+            driver.command = {"epoch": 1, "why": "focus"}
+        elif ended_by == "silence":
+            driver.repeats = False
+        elif ended_by == "mode":
+            await driver.say(do="mode", mode="none")
+        if ended_by != "close":
+            await driver.until(lambda control: control["mode"] == "none")
+            await soon(lambda: ("mode", Mode("none")) in robot.machine.commands)
+    await soon(lambda: ("mode", Mode("none")) in robot.machine.commands)
+    assert ("drive", Drive()) in robot.machine.commands[-3:] or ended_by == "mode"
+    assert moves(robot) == []
+
+
+async def test_a_robot_that_is_driven_stops_before_it_moves_by_itself(scene: Scene, robot: Gateway) -> None:
+    async with opened(scene) as driver:
+        await driver.take()
+        await driver.drive(0.5)
+        await soon(lambda: robot.driven[-1].moving)  # type: ignore[attr-defined]
+        driver.command = {}
+        await driver.say(do="mode", mode="autonomous")
+        await driver.until(lambda control: control["mode"] == "autonomous")
+        assert robot.machine.commands[-2:] == [("drive", Drive()), ("mode", Mode("autonomous"))]
 
 
 async def test_a_stop_by_anybody_ends_control_and_says_so(scene: Scene, robot: Gateway) -> None:

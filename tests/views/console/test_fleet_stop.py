@@ -9,11 +9,11 @@ from collections.abc import AsyncIterator
 import pytest
 
 from tests.client import World
-from zbridge.client.stops import Outcome, StopWaits, new_stop
+from zbridge.client.stops import NAMED, Outcome, StopWaits, new_stop
 from zbridge.errors import BusError, NotReady, Unsupported
 from zbridge.fleet import topics
 from zbridge.fleet.messages import FleetMessage, Motion, Pose, Status
-from zbridge.views.console.fleet_stop import NAMED, StopReport, judge, stop_fleet
+from zbridge.views.console.fleet_stop import StopReport, judge, stop_fleet
 
 CONFIRMED = "stopped (their gateways sent it)"
 MOVES = "still moves by its own pose or speed"

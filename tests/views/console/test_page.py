@@ -40,7 +40,7 @@ class SlowSocket:
 async def served() -> AsyncIterator[tuple[SlowSocket, Page]]:
     socket: Any = SlowSocket()
     follower = FleetFollower(lambda: b"all")
-    page = Page(socket, follower, lambda request: None)
+    page = Page(socket, follower, lambda: True, lambda request: None)
     page.tell = follower.tell  # type: ignore[attr-defined]
     serving = asyncio.create_task(page.serve())
     try:
@@ -133,4 +133,4 @@ async def test_a_page_that_has_left_while_something_is_sent_to_it_ends_without_a
             raise error
 
     socket: Any = Gone()
-    await Page(socket, FleetFollower(lambda: b"all"), lambda request: None).serve()
+    await Page(socket, FleetFollower(lambda: b"all"), lambda: True, lambda request: None).serve()

@@ -15,6 +15,7 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Pose, Text
 from zbridge.fleet.topics import KeySpace, Topic
+from zbridge.metrics import Metrics
 from zbridge.views.console import robot_watch
 from zbridge.views.console.robot_watch import KEYS, TEXT_BYTES, TEXTS, RobotWatch, RobotWatches
 
@@ -29,7 +30,8 @@ class Clock:
 class Scene:
     def __init__(self) -> None:
         self.network, self.clock = FakeBus(), Clock()
-        self.watch = RobotWatch(self.network.join("console"), KeySpace("fleet", "r1"), lambda: b"\x90", self.clock)
+        self.metrics, keys = Metrics(), KeySpace("fleet", "r1")
+        self.watch = RobotWatch(self.network.join("console"), keys, lambda: b"\x90", self.metrics, self.clock)
 
     def put(self, path: str, payload: bytes, robot: str = "r1") -> None:
         topic = topics.find(path) or Topic(path, Pose, topics.Delivery.STREAM)
@@ -70,7 +72,15 @@ async def test_of_each_key_the_newest_message_is_news_once(scene: Scene) -> None
     assert "sensor/front" not in scene.news(number)[1]
 
 
-async def test_a_message_has_its_time_and_the_mean_of_the_last_periods(scene: Scene) -> None:
+async def test_a_pause_of_a_key_is_not_its_period_from_then_on(scene: Scene) -> None:
+    for pause in (0.1, 0.1, 60.0, 0.1):
+        scene.put("pose", pose(0.0))
+        scene.clock.now += pause
+    scene.put("pose", pose(0.0))
+    assert scene.news()[1]["pose"][0][1] == pytest.approx(0.1)
+
+
+async def test_a_message_has_its_time_and_the_median_of_the_last_periods(scene: Scene) -> None:
     scene.put("pose", pose(0.0))
     assert scene.news()[1]["pose"][0][:2] == (100.0, 0.0)
     for _ in range(20):
@@ -110,7 +120,7 @@ async def test_no_more_keys_are_kept_than_fit_and_the_rest_is_counted(scene: Sce
     for number in range(KEYS + 5):
         scene.put(f"sensor/s{number}", b"\x80")
     assert len(scene.news()[1]) == KEYS
-    assert scene.watch.left_out >= 5
+    assert scene.metrics.total("console_keys_left_out") >= 5
     scene.put("sensor/s0", b"\x81")
     assert scene.news()[1]["sensor/s0"][0][2] == b"\x81"
 
@@ -140,7 +150,7 @@ async def test_the_sessions_of_its_processes_are_queried_again_and_again(monkeyp
 
 async def test_a_robot_is_subscribed_to_while_a_page_looks_at_it_and_no_longer() -> None:
     network = FakeBus()
-    watches = RobotWatches(network.join("console"), "fleet", lambda robot: b"\x90")
+    watches = RobotWatches(network.join("console"), "fleet", lambda robot: b"\x90", Metrics())
     one, other = watches.join("r1"), watches.join("r1")
     assert one is other
     assert subscriptions(network, "fleet/r1/*") == 1
@@ -152,7 +162,7 @@ async def test_a_robot_is_subscribed_to_while_a_page_looks_at_it_and_no_longer()
 
 async def test_a_change_of_the_history_is_news() -> None:
     network, entries = FakeBus(), [b"\x90"]
-    watches = RobotWatches(network.join("console"), "fleet", lambda robot: entries[-1])
+    watches = RobotWatches(network.join("console"), "fleet", lambda robot: entries[-1], Metrics())
     watch = watches.join("r1")
     number, _ = watch.news(0)
     entries.append(b"\x91\x01")

@@ -42,7 +42,7 @@ async def latched(robot: Gateway) -> None:
 
 
 def notice(message: dict[str, Any], of: str) -> dict[str, Any]:
-    """What a message says of a stop of ``all``, or of ``one`` robot; nothing if it does not."""
+    """What a message says of an order of a robot, or "" of all; nothing if it does not."""
     found: dict[str, Any] = message.get("notices", {}).get(of) or {}
     return found
 
@@ -62,15 +62,15 @@ async def test_a_page_gets_all_robots_and_what_has_come_of_a_stop(scene: Scene) 
         first = await until(opened, lambda message: len(message.get("rows", ())) == 2)
         assert sorted(row["name"] for row in first["rows"]) == ["r1", "r2"]
         await opened.send(json.dumps({"do": "stop_all"}))
-        assert (await until(opened, lambda message: notice(message, "all")))["notices"]["all"]["good"] is None
-        done = await until(other, lambda message: notice(message, "all").get("good") is not None)
-        assert done["notices"]["all"]["text"] == f"2 of 2 {CONFIRMED}"
+        assert (await until(opened, lambda message: notice(message, "")))["notices"][""]["good"] is None
+        done = await until(other, lambda message: notice(message, "").get("good") is not None)
+        assert done["notices"][""]["text"] == f"2 of 2 {CONFIRMED}"
         assert {gateway.control.state for gateway in scene.world.gateways.values()} == {"latched"}
         await until(opened, lambda message: all(row["latched"] for row in message.get("rows", [{"latched": 0}])))
         late = scene.page()
         async with late as opened_late:
             snapshot = await until(opened_late, lambda message: message.get("full"))
-            assert snapshot["notices"]["all"]["text"] == f"2 of 2 {CONFIRMED}"
+            assert snapshot["notices"][""]["text"] == f"2 of 2 {CONFIRMED}"
 
 
 async def test_a_robot_that_was_released_and_driven_is_stopped_by_the_next_press_at_once(scene: Scene) -> None:
@@ -87,25 +87,92 @@ async def test_a_robot_that_was_released_and_driven_is_stopped_by_the_next_press
             await opened.send(json.dumps({"do": "stop_all"}))
             await latched(robot)
         assert robot.machine.stops > stops
-        done = await until(opened, lambda message: notice(message, "all").get("good") is not None)
-        assert done["notices"]["all"]["text"] == f"2 of 2 {CONFIRMED}"
+        done = await until(opened, lambda message: notice(message, "").get("good") is not None)
+        assert done["notices"][""]["text"] == f"2 of 2 {CONFIRMED}"
+
+
+async def test_a_stop_right_after_a_release_is_a_press_of_its_own(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(orders, "SAME_PRESS_S", 60.0)
+    robot = scene.world.gateways["r1"]
+    async with scene.page() as opened:
+        await opened.send(json.dumps({"do": "stop_all"}))
+        await latched(robot)
+        await opened.send(json.dumps({"do": "stop_all"}))
+        await opened.send(json.dumps({"do": "release"}))
+        async with asyncio.timeout(1):
+            while robot.control.state == "latched":  # noqa: ASYNC110
+                await asyncio.sleep(0.01)
+        await opened.send(json.dumps({"do": "stop_all"}))
+        await latched(robot)
+        done = await until(opened, lambda message: notice(message, "").get("good") is not None)
+    assert done["notices"][""]["text"] == f"2 of 2 {CONFIRMED}"
+
+
+async def test_what_came_of_an_earlier_stop_hides_no_later_release(scene: Scene) -> None:
+    async with scene.page() as opened:
+        await opened.send(json.dumps({"do": "stop_all"}))
+        await latched(scene.world.gateways["r2"])
+        await opened.send(json.dumps({"do": "release"}))
+        await until(opened, lambda message: notice(message, "").get("text") == "2 of 2 released")
+        await asyncio.sleep(2.0)
+        async with scene.page() as late:
+            snapshot = await until(late, lambda message: message.get("full"))
+    assert snapshot["notices"][""]["text"] == "2 of 2 released"
+
+
+async def test_a_robot_of_the_roster_that_is_not_on_the_bus_is_missing_from_a_stop_of_all(scene: Scene) -> None:
+    scene.roster.add(["r9"])
+    async with scene.page() as opened:
+        await opened.send(json.dumps({"do": "stop_all"}))
+        done = await until(opened, lambda message: notice(message, "").get("good") is not None)
+    text = f"2 of 3 {CONFIRMED}; r9 without a gateway, which nothing can stop from here"
+    assert (done["notices"][""]["text"], done["notices"][""]["good"]) == (text, False)
+
+
+async def test_of_single_robots_the_last_news_are_kept_and_bad_ones_the_longest(scene: Scene) -> None:
+    good = [f"r{number}" for number in range(1, 3)]
+    bad = [f"gone{number}" for number in range(console.NOTICES - 1)]
+    async with scene.page() as opened:
+        for robot in (*bad, *good):
+            await opened.send(json.dumps({"do": "stop", "robot": robot}))
+        done = await until(opened, lambda message: all(notice(message, robot).get("good") is False for robot in bad))
+    assert [robot for robot in done["notices"] if robot in bad] == sorted(bad)
+    assert len(done["notices"]) == console.NOTICES
+
+
+async def test_a_stop_is_sent_however_many_orders_are_under_way(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(orders, "ORDERS", 1)
+    async with scene.page() as opened:
+        await until(opened, lambda message: len(message.get("rows", ())) == 2)
+        await opened.send(json.dumps({"do": "stop", "robot": "gone"}))
+        for request in ({"do": "stop", "robot": "lost"}, {"do": "unlatch", "robot": "r1"}):
+            await opened.send(json.dumps(request))
+            told = await until(opened, lambda message: "warning" in message)
+            assert (told["action"], told["robot"]) == (request["do"], request["robot"])
+            assert told["warning"].endswith("NOT sent: 1 orders are under way; STOP ALL always works")
+        await opened.send(json.dumps({"do": "stop", "robot": "r1"}))
+        await until(opened, lambda message: notice(message, "r1").get("good"))
+        await opened.send(json.dumps({"do": "stop_all"}))
+        await latched(scene.world.gateways["r2"])
 
 
 async def test_what_is_said_of_one_robot_hides_nothing_that_was_said_of_all(scene: Scene) -> None:
     async with scene.page() as opened:
         await opened.send(json.dumps({"do": "stop_all"}))
-        await until(opened, lambda message: notice(message, "all").get("good"))
+        await until(opened, lambda message: notice(message, "").get("good"))
         await opened.send(json.dumps({"do": "stop", "robot": "r9"}))
-        done = await until(opened, lambda message: notice(message, "one").get("good") is False)
-        assert done["notices"]["all"]["text"] == f"2 of 2 {CONFIRMED}"
+        done = await until(opened, lambda message: notice(message, "r9").get("good") is False)
+        assert done["notices"][""]["text"] == f"2 of 2 {CONFIRMED}"
 
 
 async def test_a_release_names_who_is_latched_by_a_stop_of_its_own(scene: Scene) -> None:
     await scene.world.fleet["r2"].latch("wet floor")
     async with scene.page() as opened:
         await opened.send(json.dumps({"do": "release"}))
-        done = await until(opened, lambda message: notice(message, "all").get("good") is not None)
-    said = done["notices"]["all"]
+        done = await until(opened, lambda message: notice(message, "").get("good") is not None)
+    said = done["notices"][""]
     assert not said["good"]
     assert said["text"].endswith("still latched by a stop of its own, released on the robot's page: r2")
 
@@ -113,8 +180,8 @@ async def test_a_release_names_who_is_latched_by_a_stop_of_its_own(scene: Scene)
 async def test_one_robot_is_stopped_and_the_other_one_is_not(scene: Scene) -> None:
     async with scene.page() as opened:
         await opened.send(json.dumps({"do": "stop", "robot": "r2"}))
-        done = await until(opened, lambda message: notice(message, "one").get("good") is not None)
-    assert done["notices"]["one"]["text"] == "r2 stopped (its gateway sent it)"
+        done = await until(opened, lambda message: notice(message, "r2").get("good") is not None)
+    assert done["notices"]["r2"]["text"] == "r2 stopped (its gateway sent it)"
     assert scene.world.gateways["r2"].machine.stops
     assert not scene.world.gateways["r1"].machine.stops
 
@@ -154,7 +221,7 @@ async def test_a_page_gets_what_the_robot_publishes_that_it_looks_at(scene: Scen
         assert subscriptions(scene.world.bus, "fleet/r1/*") == 0
         await opened.send(json.dumps({"do": "look"}))
         await opened.send(json.dumps({"do": "stop", "robot": "r1"}))
-        await until(other, lambda message: notice(message, "one").get("good"))
+        await until(other, lambda message: notice(message, "r1").get("good"))
         assert subscriptions(scene.world.bus, "fleet/r2/*") == 0
 
 
@@ -172,7 +239,7 @@ async def test_who_drove_and_who_stopped_a_robot_is_told(scene: Scene) -> None:
         await opened.send(json.dumps({"do": "look", "robot": "r1"}))
         async with scene.world.others.control("ann"):
             await opened.send(json.dumps({"do": "stop", "robot": "r1"}))
-            await until(opened, lambda message: notice(message, "one").get("good"))
+            await until(opened, lambda message: notice(message, "r1").get("good"))
         await opened.send(json.dumps({"do": "look", "robot": "r1"}))
         _, entries = await robot_news(opened, "@history")
         assert [entry["text"] for entry in entries] == ["ann drives", "stopped by this console: ann no longer drives"]
@@ -183,14 +250,13 @@ async def test_a_switch_is_sent_or_refused_by_what_the_robot_accepts(scene: Scen
     async with scene.page() as opened:
         for name in ("light", "lidar"):
             await opened.send(json.dumps({"do": "switch", "robot": "r1", "name": name, "on": True}))
-            done = await until(opened, lambda message: notice(message, "one"))
+            done = await until(opened, lambda message: notice(message, "r1"))
             good = name == "light"
-            assert notice(done, "one")["good"] is good
+            assert notice(done, "r1")["good"] is good
     assert [name for name, _ in scene.world.machine.commands] == ["light"]
 
 
-async def test_a_page_hears_something_while_nothing_changes(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(console, "ALIVE_S", 0.0)
+async def test_a_page_hears_something_while_nothing_changes(scene: Scene) -> None:
     async with scene.page() as opened:
         await until(opened, lambda message: message == {})
 
@@ -249,7 +315,7 @@ async def test_a_page_that_sends_what_it_must_not_is_closed_and_others_stay(scen
         with pytest.raises(ConnectionClosed):
             await until(bad, lambda message: False)
         await good.send(json.dumps({"do": "stop", "robot": "r1"}))
-        await until(good, lambda message: notice(message, "one").get("good"))
+        await until(good, lambda message: notice(message, "r1").get("good"))
 
 
 async def test_there_are_no_more_pages_than_fit(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,7 @@ import pytest
 from zbridge.errors import ConfigError
 from zbridge.security.access import GRANTS, Keys, MessageKind
 from zbridge.views.console import users
+from zbridge.views.console.http_server import network_of
 from zbridge.views.console.logins import ADDRESSES, LOGINS, LOGINS_EACH, LONGEST_S, UNUSED_S, Attempts, Logins
 from zbridge.views.console.rights import NEEDS, Action, Caller, rights_of
 from zbridge.views.console.users import User, hash_password, hash_token, is_password, load_users, new_token, save_users
@@ -129,6 +130,10 @@ def test_a_login_ends_by_time_by_logout_and_with_its_user() -> None:
         key = key if step > 1 else hash_token(logins.begin("ann", ANN, 0.0))
         assert logins.find(key, known, 1000.0 * step) is not None
     assert logins.find(key, known, LONGEST_S) is None
+    key = hash_token(logins.begin("ann", ANN, 0.0))
+    with_token = User("operator", "hash", {"lab": "token"})
+    assert logins.find(key, {"ann": with_token}, 1.0) is not None
+    logins.end(key)
     for changed in ({}, {"ann": User("viewer", "hash")}, {"ann": User("operator", "another")}):
         key = hash_token(logins.begin("ann", ANN, 0.0))
         assert logins.find(key, changed, 1.0) is None
@@ -159,8 +164,35 @@ def test_attempts_are_limited_by_address_and_one_address_locks_nobody_out() -> N
     assert attempts.take("desk", "ann", 0.0)
     assert not attempts.take("evil", "ann", 9.0)
     assert attempts.take("evil", "ann", 11.0)
+    assert not attempts.take("evil", "ann", 11.0)
     attempts.succeeded("evil")
     assert attempts.take("evil", "ann", 11.0)
+    assert not attempts.take("evil", "ann", 11.0), "a login is no licence to try others"
+
+
+def test_the_attempts_of_one_address_forget_those_at_no_name() -> None:
+    attempts = Attempts()
+    for number in range(30):
+        attempts.take(f"address{number}", "ann", 0.0)
+    for number in range(2 * ADDRESSES):
+        attempts.take("evil", f"name{number}", 0.0)
+    assert not attempts.take("desk", "ann", 0.0), "they are limited as before"
+
+
+@pytest.mark.parametrize(
+    ("address", "network"),
+    [
+        ("192.0.2.7", "192.0.2.7"),
+        ("2001:db8::1", "2001:db8::/64"),
+        ("2001:db8::ffff:2", "2001:db8::/64"),
+        ("2001:db8:0:1::1", "2001:db8:0:1::/64"),
+        ("::ffff:192.0.2.7", "192.0.2.7"),
+        ("fe80::1%eth0", "fe80::/64"),
+        ("", ""),
+    ],
+)
+def test_a_host_has_one_network_and_many_addresses(address: str, network: str) -> None:
+    assert network_of(address) == network
 
 
 def test_attempts_at_one_name_from_everywhere_are_limited_and_forgotten_in_time() -> None:

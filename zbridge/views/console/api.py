@@ -16,14 +16,13 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
 
-from zbridge.errors import BusError, PayloadError, Refused
+from zbridge.errors import BusError, PayloadError, RateLimited, Refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.topics import KeySpace, Topic, is_name
 from zbridge.version import __version__
-from zbridge.views.console.callers import refusal_status
 from zbridge.views.console.console import Console
-from zbridge.views.console.fleet_stop import StopReport
+from zbridge.views.console.orders import Order
 from zbridge.views.console.rights import Action, Caller
 
 BODY_BYTES = 4096
@@ -89,7 +88,11 @@ class Api:
 
     def _endpoint(self, operations: Mapping[str, Operation]) -> Callable[[Request], Awaitable[Response]]:
         async def answer(request: Request) -> Response:
-            return await self._answer(operations["GET" if request.method == "HEAD" else request.method], request)
+            operation = operations["GET" if request.method == "HEAD" else request.method]
+            response = await self._answer(operation, request)
+            if response.status_code >= 400:
+                self.console.metrics.count("console_requests_refused", status=str(response.status_code)).value += 1
+            return response
 
         return answer
 
@@ -111,7 +114,10 @@ class Api:
             body = await _read(operation.body, request) if operation.body is not None else None
         except (msgspec.MsgspecError, TimeoutError, ClientDisconnect) as error:
             return problem(400, f"{error}"[:200] or "the body did not come in time")
-        return await operation.handle(self, request, caller, body)
+        try:
+            return await operation.handle(self, request, caller, body)
+        except RateLimited as refusal:
+            return problem(429, str(refusal))
 
     # Logins
 
@@ -122,9 +128,13 @@ class Api:
         try:
             secret, caller = await console.callers.log_in(body.user, body.password, caller.address)
         except Refused as refusal:
-            console.journal.note(msgspec.structs.replace(caller, user=body.user), "login", result=f"refused: {refusal}")
+            limited = isinstance(refusal, RateLimited)
+            if not limited:
+                user = body.user if console.callers.has(body.user) else ""  # else it may be a password
+                caller = msgspec.structs.replace(caller, user=user)
+                console.journal.note(caller, "login", result=str(refusal), refused=True)
             await asyncio.sleep(REFUSED_S)  # who tries passwords must not delay who drives
-            return problem(refusal_status(refusal), str(refusal))
+            return problem(429 if limited else 401, str(refusal))
         console.journal.note(caller, "login", result="ok")
         return answered(self._me(caller), cookie=console.callers.cookie(secret))
 
@@ -150,7 +160,7 @@ class Api:
         return answered(row) if row is not None else problem(404, "no such robot")
 
     async def events(self, request: Request, caller: Caller, body: None) -> Response:
-        if self.console.full:
+        if self.console.is_full(caller):
             return problem(503, "as many follow the fleet as may")
         return StreamingResponse(self._events(caller), media_type="text/event-stream")
 
@@ -160,7 +170,7 @@ class Api:
                 yield b"data: " + await follower.next() + b"\n\n"
 
     async def stop(self, request: Request, caller: Caller, body: None) -> Response:
-        return answered(await self.console.orders.stop(caller, request.path_params["robot"]))
+        return await _report(self.console.orders.stop(caller, request.path_params["robot"]))
 
     async def stop_all(self, request: Request, caller: Caller, body: None) -> Response:
         return await _report(self.console.orders.stop_all(caller))
@@ -172,8 +182,11 @@ class Api:
         if body.robot and not is_name(body.robot):
             return problem(404, "no such robot")
         if body.robot:
-            return answered(await self.console.orders.unlatch(caller, body.robot))
+            return await _report(self.console.orders.unlatch(caller, body.robot))
         return await _report(self.console.orders.release_all(caller))
+
+    async def metrics(self, request: Request, caller: Caller, body: None) -> Response:
+        return Response(self.console.metrics.exposition(), media_type="text/plain; version=0.0.4")
 
     async def document(self, request: Request, caller: Caller, body: None) -> Response:
         return answered(openapi())
@@ -217,12 +230,12 @@ def _reader(name: str) -> Callable[[Api, Request, Caller, Any], Awaitable[Respon
     return read
 
 
-async def _report(task: asyncio.Task[StopReport]) -> Response:
+async def _report(order: Order) -> Response:
     """Answer with what came of something that others may have begun too, and that a STOP ALL replaces."""
     try:
-        return answered(await asyncio.shield(task))
+        return answered(await asyncio.shield(order))
     except asyncio.CancelledError:
-        if not task.cancelled():
+        if not order.cancelled():
             raise
         return problem(409, "a STOP ALL has begun meanwhile: its answer counts")
 
@@ -304,5 +317,6 @@ OPERATIONS: tuple[Operation, ...] = (
     Operation(
         "POST", "/api/unlatch", "release the fleet, or one robot", _REPORT, Api.unlatch, Action.UNLATCH, UnlatchRequest
     ),
+    Operation("GET", "/metrics", "what was refused and dropped", "for Prometheus", Api.metrics, Action.LOOK),
     Operation("GET", "/api/openapi.json", "this document", "OpenAPI 3.1", Api.document),
 )

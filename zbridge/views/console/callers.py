@@ -18,7 +18,8 @@ from starlette.datastructures import Headers
 from starlette.requests import cookie_parser
 from starlette.types import Scope
 
-from zbridge.errors import ConfigError, RateLimited, Refused, Unsupported
+from zbridge.errors import ConfigError, RateLimited, Unsupported
+from zbridge.views.console.http_server import network_of
 from zbridge.views.console.logins import LONGEST_S, Attempts, Login, Logins
 from zbridge.views.console.rights import Caller, rights_of
 from zbridge.views.console.users import User, hash_token, is_password, load_users
@@ -59,6 +60,10 @@ class Callers:
     def with_login(self) -> bool:
         """Whether users log in."""
         return self._file is not None
+
+    def has(self, name: str) -> bool:
+        """Return whether there is a user of this name."""
+        return name in self._users
 
     def refresh(self) -> str | None:
         """Read the file of users again if it has changed; return why it cannot be read. May run on a thread."""
@@ -108,7 +113,8 @@ class Callers:
 
     async def log_in(self, name: str, password: str, address: str) -> tuple[str, Caller]:
         """Return the secret for the cookie, and the caller; raise RateLimited, or Unsupported for a wrong password."""
-        if not self._attempts.take(address, name, self._clock()):
+        network = network_of(address)
+        if not self._attempts.take(network, name, self._clock()):
             raise RateLimited("too many attempts: wait a minute")
         if self._hashes >= HASHES:
             raise RateLimited("too many people log in at this moment: try again")
@@ -122,7 +128,7 @@ class Callers:
             self._hashes -= 1
         if account is None or not right:
             raise Unsupported("no such user, or another password")
-        self._attempts.succeeded(address)
+        self._attempts.succeeded(network)
         secret = self._logins.begin(name, account, self._clock())
         return secret, self._caller(name, account, address, hash_token(secret))
 
@@ -153,8 +159,3 @@ class Callers:
 
     def _caller(self, name: str, account: User, address: str, login: str = "", token: str = "") -> Caller:
         return Caller(name, account.role, rights_of(account.role) & self._rights, address, login, token)
-
-
-def refusal_status(refusal: Refused) -> int:
-    """Return the HTTP status for a login that is refused."""
-    return 429 if isinstance(refusal, RateLimited) else 401

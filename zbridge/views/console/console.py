@@ -5,40 +5,40 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
-import math
 import time
-from collections.abc import Coroutine, Iterator, Mapping
-from typing import Any
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from functools import partial
 
 import msgspec
-from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketDisconnected
+from starlette.websockets import WebSocket
 
 from zbridge.bus import Bus
 from zbridge.client.fleet import Fleet
 from zbridge.client.fleet_model import FleetModel
+from zbridge.errors import RateLimited
 from zbridge.fleet.topics import is_name
 from zbridge.metrics import Metrics
-from zbridge.tasks import Tasks
 from zbridge.views.console.callers import Callers
 from zbridge.views.console.drive_socket import DriveSocket
 from zbridge.views.console.feed import FleetFeed
 from zbridge.views.console.history import ControlHistory
 from zbridge.views.console.journal import Journal
 from zbridge.views.console.orders import Orders
-from zbridge.views.console.page import FleetFollower, Page, Request
+from zbridge.views.console.page import LOGIN_ENDED, FleetFollower, Page, Request
 from zbridge.views.console.rights import Action, Caller
 from zbridge.views.console.robot_watch import RobotWatches
 from zbridge.views.console.roster import Roster
 from zbridge.views.console.seats import Seat, Seats
 
 REFRESH_S = 0.5
-"""Seconds between two looks at the fleet."""
-FOLLOWERS, DRIVES = 100, 32
-"""Most pages and programs that follow the fleet, and most pages that drive, at a time; further ones are told so."""
-ORDERS = 32
-"""Most stops of single robots, releases and switches that pages have under way."""
-ALIVE_S = 2.0
-"""Pages hear something at least so often, seconds: one that hears nothing does not take what it shows for present."""
+"""Seconds between two looks at the fleet. Pages are told then, also if nothing has changed: that it is so."""
+FOLLOWERS, FOLLOWERS_EACH = 100, 25
+"""Most pages and programs that follow the fleet at a time, and most of one user; further ones are told so."""
+DRIVES, DRIVES_EACH = 32, 16
+"""Most pages that drive, and most of one user."""
+NOTICES = 4
+"""Notices of single robots that are shown."""
 FULL, FORBIDDEN = 1013, 1008
 """Codes by which sockets are closed."""
 _encode = msgspec.json.Encoder().encode
@@ -54,8 +54,9 @@ _ACTIONS: Mapping[str, Action] = {
 
 
 class StopNotice(msgspec.Struct, frozen=True):
-    """What pages are told of a stop or a release. at: Unix seconds. good: None while it is on its way."""
+    """What pages are told of an order, a stop for example. at: Unix seconds. good: None while it is not known."""
 
+    action: str
     text: str
     at: float
     good: bool | None = None
@@ -76,23 +77,23 @@ class Console:
         faults: dict[str, str | None],
     ) -> None:
         self.notices: dict[str, StopNotice] = {}
-        """The last one ``"all"`` of the fleet, and ``"one"`` of a single robot since."""
+        """The last one of each robot, and under "" that of the fleet."""
         self.fleet, self.bus, self.callers, self.journal = fleet, bus, callers, journal
         self.feed = FleetFeed(model)
         self._model = model
         self._roster = roster
-        self._metrics = metrics
+        self.metrics = metrics
         self._faults = faults
+        self._fault: str | None = None
         self._history = ControlHistory(bus, fleet.realm, lambda robot: self._watches.history_changed(robot))
-        self._watches = RobotWatches(bus, fleet.realm, self._history.payload)
+        self._watches = RobotWatches(bus, fleet.realm, self._history.payload, metrics)
         self.orders = Orders(fleet, bus, self.feed, roster, self._history, journal, self._notify)
-        self._followers: set[FleetFollower] = set()
-        self._sockets: dict[WebSocket, Caller] = {}
-        self._work = Tasks()
+        self._followers: dict[FleetFollower, str] = {}
+        """All of them, and the user of each."""
+        self._drives: Counter[str] = Counter()
+        """Pages that drive, by user."""
         self._connected = True
-        self._told_at = -math.inf
         self._seats = Seats()
-        self._drives = 0
         self._numbers = itertools.count(1)
 
     def __repr__(self) -> str:
@@ -103,31 +104,30 @@ class Console:
         self._history.open()
         with contextlib.closing(self.bus.watch_connected(self._follow_bus)), contextlib.closing(self._history):
             while True:
-                self._refresh()
-                if asyncio.get_running_loop().time() - self._told_at >= ALIVE_S:
-                    self._tell(b"{}")
+                self._tell(self._changes() or b"{}")
                 self._faults["users"] = await asyncio.to_thread(self.callers.refresh)
-                self._end_logins()
                 await asyncio.to_thread(self._roster.save)
                 self._faults["roster"] = self._roster.fault
+                self._tell_faults()
                 await asyncio.sleep(REFRESH_S)
 
     async def close(self) -> None:
-        """Give back all robots, and wait for the stops that are on their way."""
+        """Give back all robots, and wait for the orders that are under way."""
         await self._seats.close()
-        await asyncio.gather(self.orders.close(), *self._work.running, return_exceptions=True)
+        await self.orders.close()
 
     # Sockets and streams
 
     async def serve(self, socket: WebSocket) -> None:
         """Serve one page."""
         caller = self.callers.recognise(socket.scope)
-        if caller is None or self.full:
-            await socket.close(FULL if caller is not None else FORBIDDEN, "log in first" if caller is None else "full")
+        if caller is None or self.is_full(caller):
+            await socket.close(LOGIN_ENDED if caller is None else FULL)
             return
         await socket.accept()
-        with self.following(caller) as follower, self._open(socket, caller):
-            page = Page(socket, follower, lambda request: self._carry_out(page, caller, request))
+        with self.following(caller) as follower:
+            is_valid = partial(self.callers.is_valid, caller)
+            page = Page(socket, follower, is_valid, lambda request: self._carry_out(page, caller, request))
             try:
                 await page.serve()
             finally:
@@ -135,49 +135,40 @@ class Console:
 
     @contextlib.contextmanager
     def following(self, caller: Caller) -> Iterator[FleetFollower]:
-        """Tell one more follower, unless the console is :attr:`full`, while the context lasts."""
+        """Tell one more follower, unless :meth:`is_full`, while the context lasts."""
         follower = FleetFollower(lambda: self._snapshot(caller))
-        self._followers.add(follower)
+        self._followers[follower] = caller.user
         try:
             yield follower
         finally:
-            self._followers.discard(follower)
+            del self._followers[follower]
 
-    @property
-    def full(self) -> bool:
-        """Whether nobody more can follow the fleet."""
-        return len(self._followers) >= FOLLOWERS
+    def is_full(self, caller: Caller) -> bool:
+        """Return whether the fleet is followed by as many as may, or by as many for this user."""
+        users = [*self._followers.values()]
+        return len(users) >= FOLLOWERS or (bool(caller.user) and users.count(caller.user) >= FOLLOWERS_EACH)
 
     async def drive(self, socket: WebSocket) -> None:
         """Serve the socket by which a page drives a robot."""
         caller, robot = self.callers.recognise(socket.scope), socket.path_params["robot"]
-        if caller is None or not caller.may(Action.DRIVE) or not is_name(robot) or self._drives >= DRIVES:
-            await socket.close(FULL if self._drives >= DRIVES else FORBIDDEN)
+        if caller is None or not caller.may(Action.DRIVE) or not is_name(robot):
+            await socket.close(LOGIN_ENDED if caller is None else FORBIDDEN)
+            return
+        user = caller.user
+        if self._drives.total() >= DRIVES or (user and self._drives[user] >= DRIVES_EACH):
+            await socket.close(FULL)
             return
         await socket.accept()
         name = self.fleet.name or "console"
-        who = f"{name}.{caller.user or f'browser{next(self._numbers)}'}"
-        seat = Seat(self.fleet, robot, who, name, caller.user, lambda: self.feed.accepts(robot))
-        self._drives += 1
+        who = f"{name}.{user or f'browser{next(self._numbers)}'}"
+        seat = Seat(self.fleet, robot, who, name, user, lambda: self.feed.accepts(robot))
+        is_valid = partial(self.callers.is_valid, caller)
+        driving = DriveSocket(socket, seat, self._seats, caller, is_valid, self.journal, self.metrics)
+        self._drives[user] += 1
         try:
-            with self._open(socket, caller):
-                await DriveSocket(socket, seat, self._seats, caller, self.journal, self._metrics).serve()
+            await driving.serve()
         finally:
-            self._drives -= 1
-
-    @contextlib.contextmanager
-    def _open(self, socket: WebSocket, caller: Caller) -> Iterator[None]:
-        """Close the socket when its caller's login ends."""
-        self._sockets[socket] = caller
-        try:
-            yield
-        finally:
-            del self._sockets[socket]
-
-    def _end_logins(self) -> None:
-        for socket, caller in self._sockets.items():
-            if not self.callers.is_valid(caller):
-                self._work.start(_end(socket))
+            self._drives[user] -= 1
 
     # What they are told
 
@@ -188,76 +179,73 @@ class Console:
         self._connected = connected
         self._tell(_encode({"bus": connected}))
 
-    def _refresh(self) -> None:
+    def _changes(self) -> bytes | None:
         self._roster.add(self.feed.alive())
-        changes = self.feed.refresh(self._roster.names, connected=self._connected)
-        if changes is not None:
-            self._tell(changes)
+        return self.feed.refresh(self._roster.names, connected=self._connected)
 
     def _snapshot(self, caller: Caller) -> bytes:
         return self.feed.snapshot(
             realm=self.fleet.realm,
             bus=self._connected,
             notices=self.notices,
-            fault="; ".join(filter(None, self._faults.values())) or None,
+            now=time.time(),
+            fault=self._fault,
             me={"user": caller.user, "role": caller.role, "may": sorted(caller.rights)},
         )
 
     def _tell(self, message: bytes) -> None:
-        self._told_at = asyncio.get_running_loop().time()
         for follower in self._followers:
             follower.tell(message)
 
-    def _notify(self, of: str, text: str, good: bool | None) -> None:
-        """Tell all. of: what is said of ``"one"`` robot hides nothing that is said of ``"all"``."""
-        if of == "all" and good is None:
+    def _tell_faults(self) -> None:
+        fault = "; ".join(filter(None, self._faults.values())) or None
+        if fault != self._fault:
+            self._fault = fault
+            self._tell(_encode({"fault": fault}))
+
+    def _notify(self, action: str, robot: str, text: str, good: bool | None) -> None:
+        """Tell all. What is said of one robot hides nothing that is said of the fleet, or bad news of another one."""
+        if not robot and good is None:
             self.notices.clear()
-        self.notices[of] = StopNotice(text, time.time(), good)
-        self._refresh()
-        self._tell(_encode({"notices": self.notices}))
+        self.notices.pop(robot, None)
+        self.notices[robot] = StopNotice(action, text, time.time(), good)
+        single = sorted(filter(None, self.notices), key=lambda each: self.notices[each].good is not True)
+        if len(single) > NOTICES:
+            del self.notices[single[0]]
+        self._tell(_encode({"notices": self.notices, "now": time.time()}))
 
     # What pages ask for
 
     def _carry_out(self, page: Page, caller: Caller, request: Request) -> None:
         action, robot = _ACTIONS[request.do], request.robot
         if not caller.may(action):
-            self.journal.note(caller, request.do, robot, "refused: no right")
-            page.warn(caller.refusal(action))
+            self.journal.note(caller, request.do, robot, "no right", refused=True)
+            page.warn(request, caller.refusal(action))
         elif request.do == "look":
             self._look(page, robot)
-        elif request.do == "stop_all":
+        else:
+            try:
+                self._order(caller, request)
+            except RateLimited as refusal:
+                page.warn(request, f"{robot}: {request.do} NOT sent: {refusal}")
+
+    def _order(self, caller: Caller, request: Request) -> None:
+        robot = request.robot
+        if request.do == "stop_all":
             self.orders.stop_all(caller)
         elif request.do == "release":
             self.orders.release_all(caller)
-        elif robot:
-            self._carry_out_for_one(page, caller, request)
-
-    def _carry_out_for_one(self, page: Page, caller: Caller, request: Request) -> None:
-        robot = request.robot
-        if request.do == "forget":
+        elif robot and request.do == "stop":
+            self.orders.stop(caller, robot)
+        elif robot and request.do == "unlatch":
+            self.orders.unlatch(caller, robot)
+        elif robot and request.do == "forget":
             self.orders.forget(caller, robot)
-            self._refresh()
-        elif len(self._work) >= ORDERS:
-            page.warn(f"{robot}: {request.do} NOT sent: {ORDERS} orders are under way; use STOP ALL")
-        elif request.do == "stop":
-            self._work.start(_await(self.orders.stop(caller, robot)))
-        elif request.do == "unlatch":
-            self._work.start(_await(self.orders.unlatch(caller, robot)))
-        elif request.name:
-            self._work.start(_await(self.orders.switch(caller, robot, request.name, on=request.on)))
+        elif robot and request.name:
+            self.orders.switch(caller, robot, request.name, on=request.on)
 
     def _look(self, page: Page, robot: str) -> None:
         """Show a page another robot, or none."""
         before = page.look(self._watches.join(robot) if robot else None)
         if before is not None:
             self._watches.leave(before.robot)
-
-
-async def _await(work: Coroutine[Any, Any, object]) -> None:
-    """Await what was told to all already."""
-    await work
-
-
-async def _end(socket: WebSocket) -> None:
-    with contextlib.suppress(WebSocketDisconnect, WebSocketDisconnected):
-        await socket.close(FORBIDDEN, "the login has ended")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -20,6 +21,8 @@ from zbridge.views.console.seats import Seat, Seats
 
 MESSAGES_HZ = 200.0
 """Most messages a second; a page that sends more is closed."""
+IDLE_S = 1.0
+"""Seconds between two looks whether the login of a page that does not drive has ended."""
 _MALFORMED, _TOO_MANY = 1003, 1008
 _encode = msgspec.json.Encoder().encode
 
@@ -50,16 +53,24 @@ _decode = msgspec.json.Decoder(PageCommand | TakeControl | GiveControl | ResumeC
 
 
 class DriveSocket:
-    """One page that drives, or wants to. metrics: count what is dropped, and why."""
+    """One page that drives, or wants to. is_valid: returns whether its caller may still be there."""
 
     def __init__(
-        self, socket: WebSocket, seat: Seat, seats: Seats, caller: Caller, journal: Journal, metrics: Metrics
+        self,
+        socket: WebSocket,
+        seat: Seat,
+        seats: Seats,
+        caller: Caller,
+        is_valid: Callable[[], bool],
+        journal: Journal,
+        metrics: Metrics,
     ) -> None:
         self._socket = socket
         self._seat = seat
         self._seats = seats
         self._metrics = metrics
         self._caller = caller
+        self._is_valid = is_valid
         self._journal = journal
         self._held = False
         self._loop = asyncio.get_running_loop()
@@ -108,6 +119,8 @@ class DriveSocket:
                 self._count("malformed")
                 await self._socket.close(_MALFORMED, f"{error}"[:100])
                 return
+            if not self._is_valid():
+                return
             now = self._loop.time()
             if not self._rate.take(now):
                 self._count("rate")
@@ -129,11 +142,13 @@ class DriveSocket:
             case ResumeControl():
                 self._resume(message.token)
             case SetMode():
+                self._note(f"mode {message.mode}", "asked")
                 self._seat.set_mode(message.mode)
+                self._link.sent(moving=self._seat.autonomous)
 
     def _take_control(self, *, takeover: bool) -> None:
         if takeover and not self._caller.may(Action.TAKE_OVER):
-            self._note("take_over", "refused: no right")
+            self._journal.note(self._caller, "take_over", self._seat.robot, "no right", refused=True)
             self._seat.notice = self._caller.refusal(Action.TAKE_OVER)
             self._changed.set()
             return
@@ -156,7 +171,7 @@ class DriveSocket:
         drive = Drive(forward=command.forward, left=command.left, turn=command.turn)
         sent = self._seat.drive(drive, command.motor)
         if sent:
-            self._link.sent(moving=command.moving)
+            self._link.sent(moving=command.moving or self._seat.autonomous)
         elif command.moving:
             self._count("refused")
             self._halt(self._seat.needs_neutral or self._seat.notice or "the command was refused", again=False)
@@ -201,7 +216,7 @@ class DriveSocket:
         self._timer = None
         due = self._link.expire(self._loop.time())
         if due is Due.NEUTRAL:
-            self._seat.drive(Drive())
+            self._seat.rest()
             self._link.sent(moving=False)
         elif due is Due.SILENT:
             self._halt("the page was silent")
@@ -213,9 +228,9 @@ class DriveSocket:
 
     async def _send(self) -> None:
         """Send ticks while the robot is driven, and what has changed."""
-        while True:
+        while self._is_valid():
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(TICK_S if self._seat.active else None):
+                async with asyncio.timeout(TICK_S if self._seat.active else IDLE_S):
                     await self._changed.wait()
             self._changed.clear()
             now = self._loop.time()

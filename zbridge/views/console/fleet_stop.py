@@ -15,7 +15,7 @@ import msgspec
 
 from zbridge.bus import Bus, Sample
 from zbridge.client.fleet import Fleet
-from zbridge.client.stops import Outcome, StopWaits
+from zbridge.client.stops import Outcome, StopWaits, listed
 from zbridge.errors import NotReady, PayloadError, Refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -31,8 +31,6 @@ STILL = 0.02
 STILL_RAD = 0.05
 ROBOTS = 10_000
 """Most robots that are watched."""
-NAMED = 20
-"""Most robots that a part of the sentence names."""
 
 
 class StopReport(msgspec.Struct, frozen=True):
@@ -87,12 +85,6 @@ def _finding(name: str, error: Exception, is_alive: Callable[[str], bool]) -> st
     if isinstance(error, NotReady):
         return "away"
     return "refused it" if isinstance(error, Refused) else "not confirmed"
-
-
-def listed(names: Collection[str]) -> str:
-    """Name some robots, and say how many more there are."""
-    named = list(names)[:NAMED]
-    return ", ".join(named) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
 
 
 class MovementWatch:

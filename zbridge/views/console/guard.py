@@ -12,6 +12,8 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from zbridge.metrics import Metrics
+
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; connect-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -31,15 +33,18 @@ _REFUSED = 1008
 class Guard:
     """Lets through what comes from our own pages, and from programs. origins: of our pages, ``scheme://host:port``."""
 
-    def __init__(self, app: ASGIApp, origins: frozenset[str]) -> None:
+    def __init__(self, app: ASGIApp, origins: frozenset[str], metrics: Metrics) -> None:
         self._app = app
+        self._count = metrics.count("console_requests_refused", status="403")
         self._origins = origins
         self._hosts = frozenset(origin.partition("://")[2] for origin in origins)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if (why := self._refused(scope)) is None:
             await self._app(scope, receive, _with_headers(send))
-        elif scope["type"] == "websocket":
+            return
+        self._count.value += 1
+        if scope["type"] == "websocket":
             await receive()
             await send({"type": "websocket.close", "code": _REFUSED, "reason": why})
         else:

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
+import ipaddress
 import socket
 import ssl
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator
@@ -55,6 +57,16 @@ def tls_context(certificate: Path, key: Path) -> ssl.SSLContext:
     return context
 
 
+@functools.lru_cache(1024)
+def network_of(address: str) -> str:
+    """Return what counts as one client: an address, or the network of an IPv6 address, of which one host has many."""
+    try:
+        found = ipaddress.IPv6Address(address.partition("%")[0])
+    except ValueError:
+        return address
+    return str(found.ipv4_mapped or ipaddress.IPv6Network((found, 64), strict=False))
+
+
 class _BoundedRequest(H11Protocol):
     """One connection: closed if the head of a request does not come in time. slow: called then."""
 
@@ -78,6 +90,11 @@ class _BoundedRequest(H11Protocol):
             self._cancel()
         elif self._head_timer is None:
             self._expect_head()
+
+    def on_response_complete(self) -> None:
+        super().on_response_complete()
+        if self.conn.their_state is h11.SEND_BODY:  # nobody reads the rest of a body, however slowly it comes
+            self.transport.close()
 
     def _expect_head(self) -> None:
         self._head_timer = self.loop.call_later(REQUEST_S, self._expire)
@@ -115,9 +132,6 @@ class _Acceptor:
         self._work = Tasks()
         self._work.start(self._accept())
 
-    def __repr__(self) -> str:
-        return f"<_Acceptor {len(self._state.connections)} connections>"
-
     def close(self) -> None:
         """Accept nothing any more."""
         self._work.cancel()
@@ -130,9 +144,9 @@ class _Acceptor:
 
     def _is_full(self, address: str) -> bool:
         connections: Iterable[Any] = self._state.connections
-        clients = [each.client[0] for each in connections if each.client is not None]
-        clients += self._handshaking.values()
-        return len(clients) >= CONNECTIONS or clients.count(address) >= EACH
+        clients = [network_of(each.client[0]) for each in connections if each.client is not None]
+        clients += map(network_of, self._handshaking.values())
+        return len(clients) >= CONNECTIONS or clients.count(network_of(address)) >= EACH
 
     async def _accept(self) -> None:
         while True:

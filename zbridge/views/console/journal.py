@@ -5,38 +5,36 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime
-from pathlib import Path
 
-from zbridge.control.audit_log import AuditFile
 from zbridge.fleet.printable import as_json, shown
-from zbridge.metrics import Metrics
 from zbridge.protocol.rate_limit import RateLimit
 from zbridge.views.console.rights import Caller
 
 FILE_BYTES, FILES = 10_000_000, 10
-LINES = (5.0, 100.0)
-"""Lines a second, and at once: one user cannot rotate older lines away quickly. Further ones are counted."""
+LINES, REFUSALS = (5.0, 100.0), (0.5, 20.0)
+"""Lines a second, and at once: nobody can rotate older lines away quickly. Further ones are counted."""
 _TEXT = 300
 
 
 class Journal:
-    """Writes what was asked for, and what came of it. write: appends a line; see :func:`open_journal`."""
+    """Writes what was asked for, and what came of it. write: appends a line."""
 
     def __init__(
         self, write: Callable[[str], None] = lambda line: None, clock_ns: Callable[[], int] = time.time_ns
     ) -> None:
         self._write = write
         self._clock_ns = clock_ns
-        self._room = RateLimit(*LINES)
+        self._rooms = {False: RateLimit(*LINES), True: RateLimit(*REFUSALS)}
+        """By whether it is a refusal: those of strangers take no room of what users do."""
         self._left_out = 0
 
     def __repr__(self) -> str:
         return f"<Journal, {self._left_out} lines left out>"
 
-    def note(self, caller: Caller, action: str, robot: str = "", result: str = "") -> None:
-        """Write one line: who, from where, what, of which robot (none: of all), and the result."""
+    def note(self, caller: Caller, action: str, robot: str = "", result: str = "", *, refused: bool = False) -> None:
+        """Write one line: who, from where, what, of which robot (none: of all), and the result, or why not."""
         now_ns = self._clock_ns()
-        if not self._room.take(now_ns / 1e9):
+        if not self._rooms[refused].take(now_ns / 1e9):
             self._left_out += 1
             return
         fields = {
@@ -46,13 +44,8 @@ class Journal:
             "address": caller.address,
             "action": action,
             "robot": robot,
-            "result": shown(result, _TEXT),
+            "result": shown(f"refused: {result}" if refused else result, _TEXT),
             "left_out": self._left_out or None,
         }
         self._left_out = 0
         self._write(as_json({name: value for name, value in fields.items() if value}))
-
-
-def open_journal(path: Path, metrics: Metrics, tell: Callable[[str | None], object]) -> AuditFile:
-    """Open the file; raise ConfigError. tell: called on a thread with why lines cannot be written; None: they can."""
-    return AuditFile(path, metrics, file_bytes=FILE_BYTES, files=FILES, tell=tell)

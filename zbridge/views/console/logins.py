@@ -66,7 +66,7 @@ class Logins:
         if login is None:
             return None
         ended = now - login.began_at >= LONGEST_S or now - login.used_at >= UNUSED_S
-        if ended or users.get(login.user) != login.account:
+        if ended or not _is_same(users.get(login.user), login.account):
             del self._logins[key]
             return None
         login.used_at = now
@@ -77,31 +77,36 @@ class Logins:
         self._logins.pop(key, None)
 
 
+def _is_same(user: User | None, account: User) -> bool:
+    """Return whether a user logs in as before. A new token for a program changes nothing."""
+    return user is not None and (user.role, user.password) == (account.role, account.password)
+
+
 class Attempts:
     """How often each address may try to log in, and how often somebody may try each name."""
 
     def __init__(self) -> None:
-        self._buckets: OrderedDict[str, RateLimit] = OrderedDict()
+        self._addresses: OrderedDict[str, RateLimit] = OrderedDict()
+        self._names: OrderedDict[str, RateLimit] = OrderedDict()
 
     def __repr__(self) -> str:
-        return f"<Attempts of {len(self._buckets)}>"
+        return f"<Attempts of {len(self._addresses)}>"
 
     def take(self, address: str, name: str, now: float) -> bool:
-        """Return whether an attempt may be made now, and count it. A refused attempt costs nothing more."""
-        buckets = [self._bucket(f"address {address}", BY_ADDRESS), self._bucket(f"name {name}", BY_NAME)]
-        if any(bucket.fill(now) < 1 for bucket in buckets):
+        """Return whether an attempt may be made now, and count it. One that its address is refused costs no name."""
+        by_address = _bucket(self._addresses, address, BY_ADDRESS)
+        if by_address.fill(now) < 1:
             return False
-        for bucket in buckets:
-            bucket.take(now)
-        return True
+        return _bucket(self._names, name, BY_NAME).take(now) and by_address.take(now)
 
     def succeeded(self, address: str) -> None:
-        """Forget the attempts of an address that preceded a login."""
-        self._buckets.pop(f"address {address}", None)
+        """Give the address back the attempt that was a login."""
+        if (bucket := self._addresses.get(address)) is not None:
+            bucket.left += 1
 
-    def _bucket(self, key: str, rate: tuple[float, float]) -> RateLimit:
-        bucket = self._buckets.pop(key, None) or RateLimit(*rate)
-        self._buckets[key] = bucket
-        if len(self._buckets) > ADDRESSES:
-            self._buckets.popitem(last=False)
-        return bucket
+
+def _bucket(buckets: OrderedDict[str, RateLimit], key: str, rate: tuple[float, float]) -> RateLimit:
+    bucket = buckets[key] = buckets.pop(key, RateLimit(*rate))
+    if len(buckets) > ADDRESSES:
+        buckets.popitem(last=False)
+    return bucket

@@ -21,6 +21,7 @@ REQUESTS_HZ = 50.0
 """Most requests a second; a page that sends more is closed."""
 PICTURES_HZ = 15.0
 """How often a page is sent at most what is new of the robot that it looks at."""
+LOGIN_ENDED = 4401
 _MALFORMED, _TOO_MANY = 1003, 1008
 _Name = Annotated[str, msgspec.Meta(max_length=255)]
 
@@ -71,11 +72,18 @@ class FleetFollower:
 
 
 class Page:
-    """A page. follower: what it is told. ask: called with what it asks for."""
+    """A page. follower: what it is told. is_valid: whether its login has not ended. ask: gets what it asks for."""
 
-    def __init__(self, socket: WebSocket, follower: FleetFollower, ask: Callable[[Request], object]) -> None:
+    def __init__(
+        self,
+        socket: WebSocket,
+        follower: FleetFollower,
+        is_valid: Callable[[], bool],
+        ask: Callable[[Request], object],
+    ) -> None:
         self._socket = socket
         self._follower = follower
+        self._is_valid = is_valid
         self._ask = ask
         self._warning: bytes | None = None
         self._rate = RateLimit(REQUESTS_HZ)
@@ -88,9 +96,9 @@ class Page:
     def __repr__(self) -> str:
         return f"<Page {self._socket.client}>"
 
-    def warn(self, text: str) -> None:
+    def warn(self, request: Request, text: str) -> None:
         """Tell this page alone why what it asked for was not done; a newer warning replaces one that waits."""
-        self._warning = msgspec.json.encode({"warning": text})
+        self._warning = msgspec.json.encode({"warning": text, "action": request.do, "robot": request.robot})
         self._warned.set()
 
     def look(self, watch: RobotWatch | None) -> RobotWatch | None:
@@ -108,8 +116,9 @@ class Page:
             await race(self._send(), self._send_warnings(), self._show_robot(), self._receive())
 
     async def _send(self) -> None:
-        while True:
+        while self._is_valid():
             await self._socket.send_text((await self._follower.next()).decode())
+        await self._socket.close(LOGIN_ENDED, "the login has ended")
 
     async def _send_warnings(self) -> None:
         while True:
@@ -137,6 +146,8 @@ class Page:
                 return
             if not self._rate.take(asyncio.get_running_loop().time()):
                 await self._socket.close(_TOO_MANY, f"more than {REQUESTS_HZ:g} requests a second")
+                return
+            if not self._is_valid():
                 return
             if not request.robot or is_name(request.robot):
                 self._ask(request)

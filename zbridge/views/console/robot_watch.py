@@ -17,6 +17,8 @@ import contextlib
 import time
 from collections import deque
 from collections.abc import Callable
+from itertools import pairwise
+from statistics import median
 
 import msgspec
 
@@ -24,6 +26,7 @@ from zbridge.bus import Bus, Handle, Sample
 from zbridge.errors import BusError
 from zbridge.fleet import topics
 from zbridge.fleet.topics import KeySpace
+from zbridge.metrics import Metrics
 from zbridge.tasks import Tasks
 
 KEYS = 512
@@ -37,7 +40,7 @@ SESSIONS_EVERY_S = 3.0
 SESSIONS_PATH, HISTORY_PATH = "@sessions", "@history"
 """Paths of what no key of the robot has: its processes' answers by name, and the history of its control."""
 _PERIODS = 8
-"""Periods whose mean is the period of a key."""
+"""Periods whose median is the period of a key."""
 _ANSWERS = 64
 """Most processes whose sessions are shown."""
 _encode = msgspec.msgpack.Encoder().encode
@@ -52,9 +55,9 @@ class _Newest(msgspec.Struct):
 
     @property
     def period_s(self) -> float:
-        """The mean of the last periods; 0 if there was none yet."""
-        between = len(self.came_s) - 1
-        return (self.came_s[-1] - self.came_s[0]) / between if between else 0.0
+        """The median of the last periods: one pause is not the period from now on. 0 if there was none yet."""
+        periods = [later - earlier for earlier, later in pairwise(self.came_s)]
+        return median(periods) if periods else 0.0
 
 
 class _KeptText(msgspec.Struct, frozen=True):
@@ -67,16 +70,20 @@ class RobotWatch:
     """One robot, while pages look at it. history: returns its control history as a payload. clock: seconds."""
 
     def __init__(
-        self, bus: Bus, keys: KeySpace, history: Callable[[], bytes], clock: Callable[[], float] = time.monotonic
+        self,
+        bus: Bus,
+        keys: KeySpace,
+        history: Callable[[], bytes],
+        metrics: Metrics,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.robot = keys.robot
         self.pages = 0
         """How many pages look at it."""
-        self.left_out = 0
-        """Messages of keys beyond :data:`KEYS`."""
         self._bus = bus
         self._keys = keys
         self._history = history
+        self._left_out = metrics.count("console_keys_left_out")
         self._clock = clock
         self._number = 0
         self._newest: dict[str, _Newest] = {}
@@ -133,7 +140,7 @@ class RobotWatch:
         newest = self._newest.pop(path, None)
         if newest is None:
             if len(self._newest) >= KEYS:
-                self.left_out += 1
+                self._left_out.value += 1
                 return
             newest = _Newest(0, b"", deque(maxlen=_PERIODS + 1))
         self._number += 1
@@ -162,11 +169,12 @@ class RobotWatch:
 class RobotWatches:
     """The robots that pages look at. history: returns the control history of a robot as a payload."""
 
-    def __init__(self, bus: Bus, realm: str, history: Callable[[str], bytes]) -> None:
+    def __init__(self, bus: Bus, realm: str, history: Callable[[str], bytes], metrics: Metrics) -> None:
         self.watched: dict[str, RobotWatch] = {}
         self._bus = bus
         self._realm = realm
         self._history = history
+        self._metrics = metrics
 
     def __repr__(self) -> str:
         return f"<RobotWatches {sorted(self.watched)}>"
@@ -175,7 +183,8 @@ class RobotWatches:
         """Return the watch of a robot for one more page, which must call :meth:`leave`."""
         watch = self.watched.get(robot)
         if watch is None:
-            watch = RobotWatch(self._bus, KeySpace(self._realm, robot), lambda: self._history(robot))
+            keys = KeySpace(self._realm, robot)
+            watch = RobotWatch(self._bus, keys, lambda: self._history(robot), self._metrics)
             self.watched[robot] = watch
             watch.open()
         watch.pages += 1

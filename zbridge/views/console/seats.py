@@ -56,6 +56,8 @@ class Seat:
         self._pilot: Pilot | None = None
         self._motor: str | None = None
         """The motor that was moved last, if it turns until it is sent 0."""
+        self.autonomous = False
+        """Whether the mode autonomous is in force, or was asked for."""
         self._work = Tasks()
 
     def __repr__(self) -> str:
@@ -78,8 +80,9 @@ class Seat:
 
     @property
     def mode(self) -> str:
-        """The mode that was set with this lease."""
-        return self._pilot.mode if self._pilot is not None else "none"
+        """The mode that was set with this lease, and has not ended."""
+        mode = self._pilot.mode if self._pilot is not None else "none"
+        return mode if self.autonomous or mode != "autonomous" else "none"
 
     def take(self, *, takeover: bool) -> None:
         """Acquire the lease, or take it over. The stick may be deflected already: it must be centred first."""
@@ -100,7 +103,17 @@ class Seat:
         self.changed()
 
     def drive(self, drive: Drive, motor: MotorCommand | None = None) -> bool:
-        """Send the robot a command; return whether it was sent. A motor that was moved is sent 0 by the next drive."""
+        """Send the robot a command; return whether it was sent. A motor that was moved is sent 0 by the next drive.
+
+        A robot that moves by itself is sent no neutral, which pages repeat all the time; motion stops it.
+        """
+        if not self.autonomous:
+            return self._drive(drive, motor)
+        if drive.moving or (motor is not None and motor.value):
+            self.halt("the mode was autonomous", moving=True)
+        return self.held
+
+    def _drive(self, drive: Drive, motor: MotorCommand | None = None) -> bool:
         if self._pilot is None:
             return False
         before = (self.needs_neutral, self.notice)
@@ -143,15 +156,24 @@ class Seat:
         if self._pilot is None:
             return
         notice = self.notice
-        if moving:
-            self.drive(Drive())
+        if moving or self.autonomous:
+            self.rest()
         self.notice = notice
         self._pilot.require_neutral(why)
         self.changed()
 
+    def rest(self) -> None:
+        """Send neutral; it ends the mode autonomous."""
+        self._drive(Drive())
+        if self.autonomous:
+            self.set_mode("none")
+
     def set_mode(self, mode: str) -> None:
-        """Set who moves the robot."""
+        """Set who moves the robot. What moves it until now ends."""
         if self.held and self._pilot is not None:
+            if mode == "autonomous":
+                self._drive(Drive())
+            self.autonomous = mode == "autonomous"
             self._work.start(self._set_mode(self._pilot, mode))
 
     async def close(self) -> None:
@@ -165,12 +187,13 @@ class Seat:
             await pilot.set_mode(mode)
         except ZbridgeError as error:
             self.notice = shown(error, _REASON)
+            self.autonomous = False
         self.changed()
 
     def _on_end(self, error: ZbridgeError | None) -> None:
         if error is not None:
             self.notice = shown(error, _REASON)
-        self.token = None
+        self.token, self.autonomous = None, False
         self.changed()
 
 

@@ -6,6 +6,7 @@ import contextlib
 import re
 import socket
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -18,6 +19,7 @@ from starlette.staticfiles import StaticFiles
 
 from zbridge.bus import Bus
 from zbridge.client.fleet import Fleet
+from zbridge.control.audit_log import AuditFile
 from zbridge.errors import ConfigError
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
@@ -27,7 +29,7 @@ from zbridge.views.console.callers import Callers
 from zbridge.views.console.console import Console
 from zbridge.views.console.guard import Guard
 from zbridge.views.console.http_server import LOOPBACK, served, tls_context
-from zbridge.views.console.journal import Journal, open_journal
+from zbridge.views.console.journal import FILE_BYTES, FILES, Journal
 from zbridge.views.console.roster import Roster
 
 _STATIC = Path(__file__).parent / "static"
@@ -110,12 +112,13 @@ async def serve(
     with contextlib.ExitStack() as stack:
         journal = Journal()
         if settings.journal is not None:
-            file = open_journal(settings.journal, metrics, lambda why: faults.update(journal=why))
+            tell = partial(faults.__setitem__, "journal")
+            file = AuditFile(settings.journal, metrics, file_bytes=FILE_BYTES, files=FILES, tell=tell)
             stack.callback(file.close)
             journal = Journal(file.write)
         async with fleet.watch(lazy=True) as model:
             console = Console(fleet, bus, model, roster, callers, journal, metrics, faults)
-            app = Guard(_application(console), frozenset(origins))
+            app = Guard(_application(console), frozenset(origins), metrics)
             async with served(app, listening, context, metrics, proxied=settings.proxied):
                 ready(origins[0])
                 try:

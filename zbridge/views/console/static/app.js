@@ -23,7 +23,7 @@ function draw() {
   requestAnimationFrame(() => {
     scheduled = false;
     if (!store) return;
-    const name = location.hash.startsWith("#/robot/") ? decodeURIComponent(location.hash.slice(8)) : null;
+    const name = namedRobot();
     document.title = `${name ?? store.realm ?? "fleet"} - zbridge console`;
     if (name !== null && !Robot) loadRobot();
     const page = name === null ? html`<${Fleet} store=${store} />` : Robot && html`<${Robot} store=${store} name=${name} />`;
@@ -31,7 +31,17 @@ function draw() {
   });
 }
 
+// The robot whose page the address names; null: none.
+function namedRobot() {
+  try {
+    return location.hash.startsWith("#/robot/") ? decodeURIComponent(location.hash.slice(8)) : null;
+  } catch {
+    return null; // it is cut off, or was typed wrongly
+  }
+}
+
 function begin(me) {
+  render(null, document.body); // nothing of a page belongs to the store before
   store = new Store(draw, me, start);
   draw();
 }
@@ -57,7 +67,7 @@ addEventListener(
   (event) => {
     if (event.key === "Escape" && !event.repeat && store) {
       event.preventDefault();
-      store.stopAll();
+      store.stop();
     }
   },
   { capture: true },

@@ -10,6 +10,7 @@ const NO_TICK_S = 0.3;
 const SLOW_S = 0.2; // round trips above this are too slow to drive
 const RESUME_S = 3; // how long the server keeps control for a page
 const AGAIN_MS = 250;
+const WAITS_S = 2; // how long what a person asked for waits for the connection
 const LIMIT = "zbridge.limit";
 const NONE = { state: "none", needs: null, notice: null, mode: "none" };
 
@@ -30,6 +31,7 @@ export class Drive {
     this.wasBlocked = null;
     this.padChanges = 0;
     this.moving = false;
+    this.soon = null;
     this.sent = { ...NEUTRAL, motor: null }; // what the robot is told
     this.lostAt = null;
     this.changed = () => {};
@@ -90,20 +92,25 @@ export class Drive {
   stop() {
     this.inputs.clear();
     this.send();
-    this.store.send({ do: "stop", robot: this.robot });
+    this.store.stop(this.robot);
   }
 
   listen() {
     const steers = (event) => this.held && !event.target.closest?.("input");
     const on = {
       keydown: (event) => {
-        if (!steers(event)) return;
-        if (event.code === "Space") this.stop();
+        if (event.key === "Meta") this.leave(); // its system keeps the releases of other keys to itself
+        if (event.code === "Space" && this.held) event.repeat || this.stop();
+        else if (!steers(event)) return;
         else if (!this.inputs.keyboard.press(event)) return;
         event.preventDefault();
         this.send();
       },
       keyup: (event) => this.inputs.keyboard.release(event) && this.send(),
+      contextmenu: (event) => (event.target.closest?.(".steering, .motors") ? event.preventDefault() : this.leave()),
+      dragstart: () => this.leave(),
+      pointerup: (event) => this.inputs.release(event) && this.send(),
+      pointercancel: (event) => this.inputs.release(event) && this.send(),
       blur: (event) => event.target === window && this.leave(),
       pagehide: () => this.leave(),
       freeze: () => this.leave(),
@@ -129,9 +136,10 @@ export class Drive {
     this.waiting = [];
     const token = this.token;
     this.token = null;
-    if (token) this.waiting.push({ do: "resume", token });
+    if (token) this.say({ do: "resume", token });
     socket.onopen = () => {
-      for (const message of this.waiting.splice(0)) this.say(message);
+      const fresh = this.waiting.splice(0).filter(({ at }) => performance.now() / 1000 - at < WAITS_S);
+      for (const { message } of fresh) this.say(message);
     };
     socket.onmessage = (event) => this.socket === socket && this.receive(JSON.parse(event.data));
     socket.onclose = () => this.socket === socket && this.lose(token);
@@ -139,7 +147,7 @@ export class Drive {
 
   say(message) {
     if (this.socket?.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
-    else if (message.do !== "drive") this.waiting?.push(message);
+    else if (message.do !== "drive") this.waiting?.push({ message, at: performance.now() / 1000 });
   }
 
   receive(message) {
@@ -194,6 +202,14 @@ export class Drive {
     return silent || (this.roundTrip ?? 0) > SLOW_S ? "link" : null;
   }
 
+  // Sends what the stick shows with the next picture: a pointer may move more often.
+  sendSoon() {
+    this.soon ??= requestAnimationFrame(() => {
+      this.soon = null;
+      this.send();
+    });
+  }
+
   send() {
     this.inputs.pads.poll();
     if (this.control.state === "none" || this.socket?.readyState !== WebSocket.OPEN || !this.tick.number) return;
@@ -215,6 +231,7 @@ export class Drive {
   noteChanges() {
     const blocked = this.blocked;
     if (this.wasBlocked && !blocked) this.begin(this.wasBlocked);
+    if (blocked && !this.wasBlocked && this.control.mode === "autonomous") this.setMode("none"); // nobody watches it
     this.wasBlocked = blocked;
     if (this.inputs.pads.changes !== this.padChanges) {
       this.padChanges = this.inputs.pads.changes;

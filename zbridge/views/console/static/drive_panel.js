@@ -104,13 +104,15 @@ function Stick({ drive }) {
   const on = (method) => (event) => {
     if (method === "down") pad.current.setPointerCapture(event.pointerId);
     stick[method](event, pad.current.getBoundingClientRect());
-    drive.send();
+    if (event.pointerId !== stick.pointer) return;
+    drive.sendSoon();
     turn((count) => count + 1);
   };
+  useEffect(() => () => stick.clear(), []);
   const { forward, turn: turns } = drive.sent;
   const { x, y } = stick.pointer === null ? { x: -turns / drive.limit, y: forward / drive.limit } : stick.at; // keys move the knob, too
   return html`<div class="stick" ref=${pad} role="img" aria-label="Stick: drag to drive"
-    onPointerDown=${on("down")} onPointerMove=${on("move")} onPointerUp=${on("up")} onPointerCancel=${on("up")}>
+    onPointerDown=${on("down")} onPointerMove=${on("move")}>
     <span class="knob" style=${{ transform: `translate(${42 * x}px, ${-42 * y}px)` }}></span>
   </div>`;
 }
@@ -153,26 +155,20 @@ function Mode({ drive, robot }) {
 function Motors({ drive, data }) {
   const [speed, setSpeed] = useState(1);
   const motors = (data.message("devices")?.devices ?? []).filter((device) => device.kind in MOTORS).slice(0, 16);
-  const command = (motor) => {
-    drive.inputs.motor = motor;
+  const hold = ({ name, kind }, value) => (event) => {
+    event.currentTarget.setPointerCapture(event.pointerId);
+    drive.inputs.hold(event, { name, value, linear: kind === "linear" });
     drive.send();
   };
-  const hold = ({ name, kind }, value) => ({
-    onPointerDown: (event) => {
-      event.currentTarget.setPointerCapture(event.pointerId);
-      command({ name, value, linear: kind === "linear" });
-    },
-    onPointerUp: () => command(null),
-    onPointerCancel: () => command(null),
-  });
+  useEffect(() => () => drive.inputs.clear(), []);
   if (!motors.length) return null;
   return html`<details class="motors" role="group" aria-label="Motors"><summary onClick=${leave}>Single motors</summary>
     <label>Value, while a button is held <input type="number" min="0" max="1000" step="any" value=${speed} aria-label="Motor value"
       onInput=${(event) => Number.isFinite(event.target.valueAsNumber) && setSpeed(event.target.valueAsNumber)} /></label>
     <div class="grid">${motors.map(
       (motor) => html`<span>${motor.name}</span>
-        <button type="button" aria-label=${`${motor.name} backwards`} ...${hold(motor, -speed)}>−</button>
-        <button type="button" aria-label=${`${motor.name} forwards`} ...${hold(motor, speed)}>+</button>
+        <button type="button" aria-label=${`${motor.name} backwards`} onPointerDown=${hold(motor, -speed)}>−</button>
+        <button type="button" aria-label=${`${motor.name} forwards`} onPointerDown=${hold(motor, speed)}>+</button>
         <span class="empty">${MOTORS[motor.kind]}</span>`,
     )}</div>
   </details>`;

@@ -96,11 +96,11 @@ function Table({ store, rows, redraw }) {
 function Row({ row, store, place, top }) {
   const stop = (event) => {
     leave(event);
-    store.send({ do: "stop", robot: row.name });
+    store.stop(row.name);
   };
   const forget = (event) => {
     leave(event);
-    store.send({ do: "forget", robot: row.name });
+    store.ask({ do: "forget", robot: row.name });
   };
   const [missing, driver] = [row.state === "NO GATEWAY", driverOf(row)];
   const why = [doubtOf(row) && "Stop may not reach it", whyOf(row)].filter(Boolean).join("; ");

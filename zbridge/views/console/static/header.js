@@ -12,7 +12,7 @@ export function Header({ store }) {
   const live = store.connected && !store.silent && store.bus;
   const stopAll = (event) => {
     leave(event);
-    store.stopAll();
+    store.stop();
   };
   return html`<header>
     <div class="bar">
@@ -28,10 +28,16 @@ export function Header({ store }) {
       ${(!store.connected || store.silent) && html`<p class="notice bad">The console does not answer: what is shown is old.</p>`}
       ${store.connected && !store.bus && html`<p class="notice bad">The bus is lost: nothing is known of the robots.</p>`}
       ${store.fault && html`<p class="notice bad">The console's own files: ${store.fault}</p>`}
-      ${store.warning && html`<${Notice} notice=${store.warning} />`}
-      ${["all", "one"].map((of) => store.notices[of] && html`<${Notice} key=${of} notice=${store.notices[of]} />`)}
+      ${[...store.stops.values()].map(({ robot, alarm }) => alarm && html`<${Notice} key=${`stop ${robot}`} notice=${alarm} />`)}
+      ${store.warning && html`<${Notice} key="warning" notice=${store.warning} />`}
+      ${newestFirst(store.notices).map(([robot, notice]) => html`<${Notice} key=${`told ${robot}`} notice=${notice} />`)}
     </div>
   </header>`;
+}
+
+// Those of the fleet before those of single robots.
+function newestFirst(notices) {
+  return Object.entries(notices).sort(([a, one], [b, other]) => Boolean(a) - Boolean(b) || other.at - one.at);
 }
 
 function Notice({ notice }) {
@@ -48,7 +54,7 @@ function Latched({ store, robots }) {
   const [asked, ask] = useState(false);
   const answer = (yes) => (event) => {
     leave(event);
-    if (yes) store.send({ do: "release" });
+    if (yes) store.ask({ do: "release" });
     ask(false);
   };
   if (!store.may("unlatch_fleet")) return html`<p class="latched">${robots} latched.</p>`;

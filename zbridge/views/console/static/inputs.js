@@ -66,10 +66,6 @@ export class PageStick {
     this.at = { x: x / far, y: y / far };
   }
 
-  up(event) {
-    if (event.pointerId === this.pointer) this.clear();
-  }
-
   clear() {
     this.pointer = null;
     this.at = { x: 0, y: 0 };
@@ -172,12 +168,26 @@ export class Inputs {
     this.stick = new PageStick();
     this.pads = new Gamepads();
     this.motor = null; // name and value of a single motor while its button is held
+    this.motorPointer = null;
+  }
+
+  hold(event, motor) {
+    this.motor = motor;
+    this.motorPointer = event.pointerId;
+  }
+
+  // Lets go what a pointer held, wherever it is released. Returns whether it held anything.
+  release(event) {
+    const [holds, turns] = [event.pointerId === this.stick.pointer, event.pointerId === this.motorPointer];
+    if (holds) this.stick.clear();
+    if (turns) this.motor = this.motorPointer = null;
+    return holds || turns;
   }
 
   clear() {
     this.keyboard.clear();
     this.stick.clear();
-    this.motor = null;
+    this.motor = this.motorPointer = null;
   }
 
   read() {

@@ -47,7 +47,7 @@ export function Switches({ row, data, store }) {
   if (!accepted.length || !store.may("switch")) return null;
   const set = (name, on) => (event) => {
     leave(event);
-    store.send({ do: "switch", robot: row.name, name, on });
+    store.ask({ do: "switch", robot: row.name, name, on });
   };
   return html`<${Panel} title="Switches">
     ${accepted.map((name) => {

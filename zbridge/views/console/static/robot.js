@@ -24,7 +24,7 @@ export function Robot({ store, name }) {
       <p>${store.known ? "The console does not know this robot." : "Loading."} <a href="#">All robots</a></p>
     </section>`;
   }
-  data.away = !PRESENT.includes(row.state) || !store.connected || !store.bus;
+  data.away = !PRESENT.includes(row.state) || !store.connected || store.silent || !store.bus;
   return html`<section class="robot">
     <${Title} row=${row} store=${store} data=${data} own=${drive?.held} />
     ${doubtOf(row) && html`<p class="band" role="alert">${doubtOf(row)} Stop may not reach it. Use the emergency stop on the robot.</p>`}
@@ -85,9 +85,9 @@ function useDrive(store, name) {
 // own: whether this page drives it.
 function Title({ row, store, data, own }) {
   const latchedAlone = (data.message("control")?.latches ?? []).some((latch) => !latch.fleet);
-  const ask = (what) => (event) => {
+  const act = (action) => (event) => {
     leave(event);
-    store.send({ do: what, robot: row.name });
+    action();
   };
   return html`<div class="title ${toneOf(row)}">
     <a class="back" href="#" aria-label="All robots">‹ All robots</a>
@@ -95,8 +95,8 @@ function Title({ row, store, data, own }) {
     <span class="state"><b>${wordOf(row)}</b></span>
     <span class="driver">${own ? "you drive" : driverText(row)}</span>
     <span class="acts">
-      ${latchedAlone && store.may("unlatch") && html`<button type="button" class="careful" onClick=${ask("unlatch")}>Release ${row.name}</button>`}
-      <button type="button" class="stop" aria-label=${`Stop ${row.name}`} onClick=${ask("stop")}>Stop</button>
+      ${latchedAlone && store.may("unlatch") && html`<button type="button" class="careful" onClick=${act(() => store.ask({ do: "unlatch", robot: row.name }))}>Release ${row.name}</button>`}
+      <button type="button" class="stop" aria-label=${`Stop ${row.name}`} onClick=${act(() => store.stop(row.name))}>Stop</button>
     </span>
     <p class="why" tabindex=${whyOf(row) ? 0 : -1}>${whyOf(row)}</p>
   </div>`;

@@ -29,9 +29,15 @@ export class RobotData {
     this.changed = () => {};
   }
 
-  // Begins anew with a console that knows nothing of what was sent before: it sends its texts again.
-  reconnected() {
+  // The console sends all anew to a page that looks, also the texts.
+  begin() {
     this.texts = [];
+  }
+
+  // Another console, or another machine, has another clock: what came before has no age any more.
+  reconnected() {
+    this.entries.clear();
+    this.poses = [];
     this.offset = null;
   }
 

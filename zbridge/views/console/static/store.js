@@ -4,11 +4,11 @@ import { whoAmI } from "./login.js";
 import { RobotData } from "./robot_data.js";
 
 const AGAIN_MS = [250, 500, 1000, 2000];
-const REFUSED = 1008; // the code by which the console ends a page whose login has ended
+const LOGIN_ENDED = 4401; // the code by which the console closes a page's socket
 const KEPT = 60; // rates of a robot that its sparkline shows
 const STALE_STOP_MS = 10000;
-const SILENT_MS = 6000; // the console says something every 2 s
-const UNANSWERED_MS = 1500; // it says at once that it sends STOP ALL
+const SILENT_MS = 3000; // the console says something every 0.5 s
+const UNANSWERED_MS = 1500; // it says at once that it sends a stop
 const ROBOTS = 8; // robots whose trail and plots are kept while another one is looked at
 
 export class Store {
@@ -18,7 +18,7 @@ export class Store {
     this.refused = refused;
     this.rows = new Map();
     this.rates = new Map();
-    this.notices = {};
+    this.notices = {}; // by robot, "" of the fleet
     this.realm = "";
     this.bus = true;
     this.connected = false;
@@ -27,8 +27,7 @@ export class Store {
     this.changed = changed;
     this.tries = 0;
     this.known = false; // whether the robots have been told
-    this.stopAt = null; // when STOP ALL was asked for and nobody answered
-    this.unanswered = null; // runs while STOP ALL is not answered
+    this.stops = new Map(); // by robot, "" for all: the stops that were pressed here and are not answered
     this.heardAt = performance.now();
     this.looked = "";
     this.robots = new Map(); // by name, the one that was looked at last at the end
@@ -62,7 +61,7 @@ export class Store {
   // Asks for what a robot publishes; "": for none.
   look(name) {
     this.looked = name;
-    if (name) this.robots.get(name)?.reconnected();
+    this.robots.get(name)?.begin();
     this.send({ do: "look", robot: name });
   }
 
@@ -71,8 +70,8 @@ export class Store {
     socket.onopen = () => {
       this.tries = 0;
       this.connected = true;
-      if (this.stopAt !== null && Date.now() - this.stopAt < STALE_STOP_MS) this.send({ do: "stop_all" });
-      this.stopAt = null;
+      for (const stop of this.stops.values()) if (performance.now() - stop.at < STALE_STOP_MS) this.sendStop(stop);
+      for (const data of this.robots.values()) data.reconnected();
       if (this.looked) this.look(this.looked);
       this.changed();
     };
@@ -84,7 +83,8 @@ export class Store {
     };
     socket.onclose = (event) => {
       if (this.closed) return;
-      if (event.code === REFUSED) return void this.refused();
+      for (const stop of this.stops.values()) if (!stop.alarm) this.alarm(stop, "was NOT confirmed: the console does not answer");
+      if (event.code === LOGIN_ENDED) return void this.refused();
       if (this.tries > 0) this.checkLogin();
       this.connected = false;
       this.changed();
@@ -101,25 +101,25 @@ export class Store {
   take(message) {
     if (message.full) this.rows.clear();
     this.known = this.known || Boolean(message.full);
-    if (message.notices?.all) this.clearUnanswered();
     if (message.me) this.me = { ...this.me, ...message.me };
-    if (message.warning) this.warning = noticed({ text: message.warning, at: Date.now() / 1000, good: false });
+    if (message.warning) this.takeRefusal(message);
     for (const row of message.rows ?? []) this.rows.set(row.name, row);
     for (const name of message.gone ?? []) {
       this.rows.delete(name);
       this.rates.delete(name);
     }
     for (const name of ["realm", "bus", "fault"]) if (name in message) this[name] = message[name];
-    if (message.notices) this.takeNotices(message.notices);
+    if (message.notices) this.takeNotices(message.notices, message.now);
     this.changed();
   }
 
-  takeNotices(notices) {
-    for (const [of, notice] of Object.entries(notices)) {
-      const before = this.notices[of];
-      notices[of] = notice.at === before?.at && notice.text === before.text ? before : noticed(notice);
-    }
+  // now: the console's clock, by which ages are right whatever this clock shows.
+  takeNotices(notices, now) {
+    for (const [robot, notice] of Object.entries(notices)) notices[robot] = { ...notice, came: performance.now() - 1000 * (now - notice.at) };
     this.notices = notices;
+    for (const { robot, request, before } of this.stops.values()) {
+      if (notices[robot]?.action === request.do && notices[robot].at !== before) this.drop(robot);
+    }
   }
 
   sample() {
@@ -132,35 +132,54 @@ export class Store {
     this.changed(); // ages
   }
 
+  // Why the console does not do what this page asked for.
+  takeRefusal({ warning, action, robot }) {
+    this.warning = noticed(warning);
+    if (this.stops.get(robot)?.request.do === action) this.drop(robot);
+  }
+
+  // Returns whether a request was sent.
   send(request) {
-    this.warning = null;
-    if (this.socket.readyState === WebSocket.OPEN) {
-      this.socket.send(JSON.stringify(request));
-      return true;
-    }
-    return false;
+    if (this.socket.readyState !== WebSocket.OPEN) return false;
+    this.socket.send(JSON.stringify(request));
+    return true;
   }
 
-  stopAll() {
-    this.clearUnanswered();
-    if (this.send({ do: "stop_all" })) {
-      const text = "STOP ALL: the console has not answered yet. Use the stop on the robots.";
-      this.unanswered = setTimeout(() => this.warn(text), UNANSWERED_MS);
-      return;
-    }
-    this.stopAt = Date.now();
-    this.warn("STOP ALL was NOT sent: the console does not answer. Use the stop on the robots.");
-  }
-
-  clearUnanswered() {
-    clearTimeout(this.unanswered);
-  }
-
-  warn(text) {
-    this.notices = { all: noticed({ text, at: Date.now() / 1000, good: false }) };
+  // Asks for what a person wants, other than stops.
+  ask(request) {
+    const what = [request.robot, request.name ?? request.do].filter(Boolean).join(": ");
+    this.warning = this.send(request) ? null : noticed(`${what} was NOT sent: the console does not answer.`);
     this.changed();
+  }
+
+  // Stops a robot, or all (""). What became of it is said: by the console, or else by this page.
+  stop(robot = "") {
+    this.drop(robot);
+    this.warning = null;
+    const request = robot ? { do: "stop", robot } : { do: "stop_all" };
+    const stop = { robot, request, at: performance.now(), before: this.notices[robot]?.at, alarm: null };
+    this.stops.set(robot, stop);
+    this.sendStop(stop);
+  }
+
+  sendStop(stop) {
+    clearTimeout(stop.timer);
+    if (!this.send(stop.request)) return this.alarm(stop, "was NOT sent: the console does not answer");
+    stop.timer = setTimeout(() => this.alarm(stop, "was sent, and the console has not answered yet"), UNANSWERED_MS);
+  }
+
+  alarm(stop, what) {
+    clearTimeout(stop.timer);
+    const [which, where] = stop.robot ? [`${stop.robot}: the stop`, "robot"] : ["STOP ALL", "robots"];
+    stop.alarm = noticed(`${which} ${what}. Use the stop on the ${where}.`);
+    this.changed();
+  }
+
+  drop(robot) {
+    clearTimeout(this.stops.get(robot)?.timer);
+    this.stops.delete(robot);
   }
 }
 
-// A notice, and when it came by the page's own clock.
-const noticed = (notice) => ({ ...notice, came: performance.now() });
+// Bad news of this page's own, now.
+const noticed = (text) => ({ text, at: Date.now() / 1000, good: false, came: performance.now() });

@@ -367,6 +367,14 @@ def test_settings_that_let_somebody_in_by_mistake_are_errors(settings: dict[str,
             ["http://console.lab:8080", "http://127.0.0.1:8080", "http://localhost:8080"],
         ),
         ({"hosts": ("console.lab",), "users": Path("u"), "proxied": True}, 8080, ["https://console.lab"]),
+        (  # behind something that passes port 443 on, as in the chart
+            {"hosts": ("console.lab:443",), "users": Path("u"), "certificate": Path("c"), "key": Path("k")},
+            8443,
+            [
+                *("https://console.lab:443", "https://127.0.0.1:8443", "https://localhost:8443"),
+                "https://console.lab",
+            ],
+        ),
         (
             {"certificate": Path("c"), "key": Path("k")},
             443,

@@ -81,14 +81,13 @@ class ConsoleSettings(msgspec.Struct, frozen=True):
     def origins(self, host: str, port: int) -> list[str]:
         """Return the origins of the console's own pages, that of its printed address first. host, port: as bound."""
         scheme = "https" if self.certificate is not None or self.proxied else "http"
-        if self.proxied:
-            return [f"{scheme}://{name}" for name in self.hosts]
-        bound = f"[{host}]" if ":" in host else host
-        names = [*self.hosts, bound, *(("localhost",) if self.listen.host in LOOPBACK else ())]
-        found = [name if _has_port(name) else f"{name}:{port}" for name in names]
-        if port == _DEFAULT_PORTS[scheme]:  # browsers leave it out
-            found += [name for name in names if not _has_port(name)]
-        return [f"{scheme}://{name}" for name in found]
+        names = list(self.hosts)
+        if not self.proxied:
+            names += [f"[{host}]" if ":" in host else host, *(("localhost",) if self.listen.host in LOOPBACK else ())]
+            names = [name if _has_port(name) else f"{name}:{port}" for name in names]
+        default = f":{_DEFAULT_PORTS[scheme]}"  # browsers leave it out
+        names += [name.removesuffix(default) for name in names if name.endswith(default)]
+        return [f"{scheme}://{name}" for name in names]
 
 
 def _has_port(name: str) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import Any
 
 import pytest
@@ -75,6 +76,25 @@ async def test_a_robot_that_the_stop_of_all_did_not_reach_is_latched_by_name_and
     assert await fleet.unlatch() == {"r1": None, "r2": None}
     stop.put(sent.payload)  # what was held up comes now
     assert [gateway.control.state for gateway in world.gateways.values()] == ["stopped", "stopped"]
+
+
+async def test_robots_without_a_gateway_share_one_wait_and_one_that_gets_one_meanwhile_is_stopped() -> None:
+    world = World("r1", "late", served=False)
+    world.gateways["r1"].serve()
+    missing = [f"gone{number}" for number in range(200)]
+    began = world.loop.time()
+    stopping = asyncio.create_task(world.fleet.latch(reason="fire", also=["late", *missing]))
+    await asyncio.sleep(CONFIRM_S / 2)
+    assert world.gateways["r1"].control.state == "latched"
+    world.gateways["late"].serve()
+    await asyncio.sleep(CONFIRM_S / 4)
+    assert world.gateways["late"].control.state == "latched", "it does not wait for the others"
+    outcomes = await stopping
+    assert world.loop.time() - began < CONFIRM_S + 0.5
+    assert (outcomes["r1"], outcomes["late"]) == (None, None)
+    assert list(outcomes) == sorted(outcomes)
+    assert {str(outcomes[name]) for name in missing[:1]} == {"gone0: stop sent, but no gateway confirmed it within 3 s"}
+    assert all(isinstance(outcomes[name], BusError) for name in missing)
 
 
 async def test_a_stop_whose_gateway_leaves_once_it_has_confirmed_it_is_not_reported_as_done() -> None:

@@ -320,6 +320,7 @@ async def test_a_robot_moves_by_itself_while_its_page_is_there_and_neutral(
             await driver.say(do="mode", mode="none")
         if ended_by != "close":
             await driver.until(lambda control: control["mode"] == "none")
+            assert driver.control["state"] == "held", "the lease stays"
             await soon(lambda: ("mode", Mode("none")) in robot.machine.commands)
     await soon(lambda: ("mode", Mode("none")) in robot.machine.commands)
     assert ("drive", Drive()) in robot.machine.commands[-3:] or ended_by == "mode"

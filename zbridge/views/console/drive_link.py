@@ -112,7 +112,7 @@ class DriveLink:
         self._epoch: int | None = None
         self._heard_at = self._accepted_at = now
         self.moving = False
-        """Whether the robot was sent motion last."""
+        """Whether the robot may move now."""
 
     def __repr__(self) -> str:
         return f"<DriveLink at tick {self._tick}, command {self._seq}>"
@@ -152,7 +152,7 @@ class DriveLink:
         return PageVerdict(centre=centre)
 
     def sent(self, *, moving: bool) -> None:
-        """Record that the robot was sent motion, or neutral, or that its lease has ended."""
+        """Record whether the robot may move now: it was sent motion, or moves by itself."""
         self.moving = moving
 
     def deadline(self) -> float:

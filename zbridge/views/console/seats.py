@@ -152,11 +152,11 @@ class Seat:
             raise NotReady(f"{self.robot} accepts no drive now")
 
     def halt(self, why: str, *, moving: bool) -> None:
-        """Require neutral. moving: whether the robot was sent motion last: it is sent neutral then."""
+        """Require neutral. moving: whether the robot may move now: it is sent neutral then."""
         if self._pilot is None:
             return
         notice = self.notice
-        if moving or self.autonomous:
+        if moving:
             self.rest()
         self.notice = notice
         self._pilot.require_neutral(why)

@@ -395,8 +395,9 @@ async def test_a_console_that_hangs_is_not_taken_for_present_and_a_stop_without_
 
 async def test_what_is_shown_is_old_while_the_console_says_nothing(browser: Browser) -> None:
     page, feed = await opened(browser)
-    feed.publish("r1", map=MAP, pose=POSE)
-    await page.locator("canvas").first.wait_for()
+    feed.publish("r1", period_s=0.0, map=MAP)
+    await page.get_by_text("in the robot's own frame").wait_for()
+    assert await page.get_by_text("Not live").count() == 0, "it came once, and stays as it is"
     feed.quiet = True
     await page.evaluate(
         "() => { const now = performance.now.bind(performance); performance.now = () => now() + 4000; }"

@@ -27,7 +27,11 @@ STATES = [
 ]
 NOBODY_ANSWERS = """() => {
   window.Real = WebSocket;
-  WebSocket = class { constructor() { setTimeout(() => this.onclose({ code: 1006 }), 10); } };
+  WebSocket = class {
+    static OPEN = 1;
+    readyState = 0;
+    constructor() { setTimeout(() => this.onclose({ code: 1006 }), 10); }
+  };
 }"""
 FILTERS = ["Connected 5", "tcpudp 10"]
 CONTROLS = ["Filter robots", *FILTERS, "Stop free", "Forget killed", "free", "zbridge console"]

@@ -71,9 +71,8 @@ class Browser:
 
     async def photograph(self, page: Any, name: str) -> None:
         """Keep a picture of the whole page for people to look at, if somebody asked for it."""
-        picture = await page.screenshot(full_page=True)
         if PICTURES is not None:
-            (Path(PICTURES) / f"{name}.png").write_bytes(picture)
+            (Path(PICTURES) / f"{name}.png").write_bytes(await page.screenshot(full_page=True))
 
     def _complain(self, text: str) -> None:
         if _READS_BACK not in text:  # the tests themselves do that

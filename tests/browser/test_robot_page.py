@@ -85,25 +85,26 @@ async def opened(browser: Browser, *, state: str = "free", **options: Any) -> tu
 
 @pytest.mark.parametrize(("size", "scheme"), [(WIDE, "light"), (NARROW, "dark")])
 async def test_every_state_is_drawn_without_a_complaint(browser: Browser, size: Any, scheme: str) -> None:
-    for state in STATES:
-        page, feed = await opened(browser, state=state, size=size, scheme=scheme)
-        feed.publish("r1", **FULL)
-        await page.get_by_text("hello").wait_for()
+    page, feed = await opened(browser, size=size, scheme=scheme)
+    for state, told_row in STATES.items():
+        feed.tell(rows=[told_row])
+        feed.publish("r1", **{**FULL, "text": {"text": f"in {state}"}})
+        await page.get_by_text(f"in {state}").last.wait_for()
         if state not in ("away", "silent", "killed"):
             await page.locator(".uplot").first.wait_for()
         assert await page.evaluate("document.documentElement.scrollWidth <= innerWidth")
         assert await page.evaluate("document.querySelector('.robot').scrollWidth <= innerWidth")
         assert await page.locator("img").count() == 0
         await browser.photograph(page, f"robot-{state}-{scheme}")
-        await page.context.close()
     assert browser.complaints == []
 
 
 async def test_where_a_stop_may_not_arrive_the_page_says_so_and_gives_no_control(browser: Browser) -> None:
+    page, feed = await opened(browser)
     for state in ("free", "held", "latched", "stalled", "away", "silent", "killed"):
-        page, feed = await opened(browser, state=state)
-        feed.publish("r1", text={"text": "here", "kind": "chat"})
-        await page.get_by_text("here").wait_for()
+        feed.tell(rows=[STATES[state]])
+        feed.publish("r1", text={"text": f"in {state}", "kind": "chat"})
+        await page.get_by_text(f"in {state}").last.wait_for()
         warned = await page.get_by_role("alert").all_inner_texts()
         take = page.get_by_role("button", name="Take control")
         driven = bool(STATES[state]["commands"])
@@ -113,7 +114,6 @@ async def test_where_a_stop_may_not_arrive_the_page_says_so_and_gives_no_control
         else:
             assert "Stop may not reach it. Use the emergency stop on the robot." in warned[0]
         assert not driven or await take.is_enabled() == (state in ("free", "held")), state
-        await page.context.close()
 
 
 async def test_what_a_robot_publishes_is_shown_and_what_it_does_not_is_said(browser: Browser) -> None:

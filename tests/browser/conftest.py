@@ -127,9 +127,9 @@ class Feed:
         """Wait until the page looks at a robot."""
         await soon(lambda: {"do": "look", "robot": robot} in self.asked)
 
-    async def close(self) -> None:
+    async def close(self, code: int | None = None) -> None:
         self.quiet = True
-        await self._socket.close()
+        await self._socket.close(code=code)
 
     async def _stay_alive(self) -> None:
         with contextlib.suppress(Exception):  # the browser is gone

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import pytest
@@ -157,7 +158,7 @@ async def cut_off(browser: Browser, **more: Any) -> tuple[Any, Feed]:
 async def test_a_stop_that_was_not_sent_is_said_until_it_is_answered_and_sent_when_the_console_is_back(
     browser: Browser, robot: str, said: str, asked: dict[str, str]
 ) -> None:
-    old = told(asked["do"], "of an earlier stop", good=True)
+    old = {**told(asked["do"], "of an earlier stop", good=True), "at": time.time() - 60}
     page, feed = await cut_off(browser, notices={robot: old})
     await page.get_by_role("button", name=f"Stop {robot}" if robot else "STOP ALL", exact=True).click()
     await page.get_by_text(said).wait_for()
@@ -167,6 +168,9 @@ async def test_a_stop_that_was_not_sent_is_said_until_it_is_answered_and_sent_wh
     assert feed.asked == [asked]
     await page.get_by_text("Live").wait_for()
     assert await page.get_by_text(said).count() == 1, "the notice of an earlier stop is no answer"
+    feed.tell(notices={robot: {**old, "at": time.time() - 30}})
+    await page.wait_for_timeout(200)
+    assert await page.get_by_text(said).count() == 1, "nor that of somebody else's, before"
     feed.tell(notices={robot: told(asked["do"], "done", good=True)})
     await page.get_by_text("done").wait_for()
     await page.get_by_text(said).wait_for(state="detached")
@@ -186,6 +190,38 @@ async def test_a_stop_without_an_answer_is_said_and_one_that_a_cut_swallowed_is_
     await soon(lambda: len(feed.asked) > count + 1)
     assert feed.asked[count:] == [{"do": "stop", "robot": "r1"}, {"do": "stop_all"}]
     assert await page.get_by_text("STOP ALL was NOT confirmed").count() == 1
+
+
+async def test_a_stop_that_a_restart_of_the_console_left_open_is_sent_again_and_one_that_was_released_is_not(
+    browser: Browser,
+) -> None:
+    feed = Feed(row("r1"))
+    page = await browser.open(feed=feed)
+    await page.get_by_role("button", name="Stop r1").click()
+    await page.keyboard.press("Escape")
+    await soon(lambda: len(feed.asked) == 2)
+    waiting = {"": told("stop_all", "STOP ALL is sent", good=None), "r1": told("stop", "r1: is sent", good=None)}
+    feed.tell(notices=waiting)
+    await page.get_by_text("STOP ALL is sent").wait_for()
+    feed.tell(notices={**waiting, "": told("release", "released", good=True)})
+    await page.get_by_text("released").wait_for()
+    await feed.close()
+    await soon(lambda: len(feed.asked) == 3)
+    assert feed.asked[2] == {"do": "stop", "robot": "r1"}
+    await page.get_by_text("r1: the stop was NOT confirmed").wait_for()
+
+
+async def test_a_page_whose_login_has_ended_says_that_it_stops_nothing(browser: Browser) -> None:
+    feed = Feed(row("r1"))
+    page = await browser.open(feed=feed)
+    await page.locator(".tall .row").first.wait_for()
+    await page.route("**/api/me", lambda route: route.abort())
+    await feed.close(4401)
+    await page.get_by_text("STOP ALL and Escape do nothing on this page").wait_for()
+    assert await page.get_by_role("button", name="STOP ALL").count() == 0
+    await page.unroute("**/api/me")
+    await page.get_by_role("button", name="STOP ALL").wait_for()
+    browser.complaints.clear()  # of the request that was refused
 
 
 async def test_what_a_person_asks_for_is_not_lost_in_silence(browser: Browser) -> None:

@@ -93,3 +93,18 @@ async def test_a_user_who_is_removed_is_shown_the_login(desk: Desk) -> None:
     save_users(desk.users, {})
     await page.get_by_label("Password").wait_for()
     await soon(lambda: desk.world.gateway.control.state == "free")
+
+
+async def test_a_stop_that_the_end_of_the_login_swallowed_is_said_with_the_login(desk: Desk) -> None:
+    page = await desk.log_in("viewer", path="/")
+    await page.locator(".tall .row").first.wait_for()
+    await page.evaluate(
+        """async () => {
+          const { csrf } = await (await fetch('/api/me')).json();
+          await fetch('/api/logout', { method: 'POST', headers: { 'x-zbridge-csrf': csrf } });
+          dispatchEvent(new KeyboardEvent('keydown', { key: 'Escape' }));
+        }"""
+    )
+    await page.get_by_label("Password").wait_for()
+    await page.get_by_text("STOP ALL was NOT confirmed").wait_for()
+    assert not desk.world.machine.stops

@@ -510,6 +510,9 @@ COURSES: dict[str, tuple[str, list[Does], list[str], bool, float | None]] = {
     "the lease expires, once": ("moving", 3 * [expire(LEASE_S)], [EXPIRED], False, None),
     "a late call finds it expired": ("moving", [expire(1000.0)], [EXPIRED], False, None),
     "motion puts the deadman off": ("moving", [applied(moving=True, at=0.4), expire(0.8)], [], True, 0.4 + WAIT_S),
+    "neutral of another part does not": (
+        *("moving", [LEFT, applied(moving=False, at=0.4, part="left motor"), expire(0.45)], [], True, WAIT_S),
+    ),
     "a command alone feeds no deadman": ("moving", [command(NEXT, 0.1)], [], True, WAIT_S),
     "nor does renewing": ("moving", [question("renew", at=0.25)], [], True, WAIT_S),
     "a command renews the lease": ("held", [command(NEXT, 1.0)], [], False, 1.0 + LEASE_S),

@@ -147,6 +147,11 @@ class Driver:
             raise refusal
         return True
 
+    @property
+    def refusal(self) -> Refused | None:
+        """Why the robot's gateway refused a command, until the next motion raises it."""
+        return self._refusal
+
     async def _send(self, topic: Topic, message: FleetMessage) -> None:
         given_ms = self._clock_ms()
         async with self._lock:

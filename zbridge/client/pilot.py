@@ -69,6 +69,11 @@ class Pilot:
     def __repr__(self) -> str:
         return f"<Pilot with {self.stick!r}, mode {self.mode}>"
 
+    @property
+    def refusal(self) -> Refused | None:
+        """Why the robot's gateway refused a command, until the next motion raises it."""
+        return self._driver.refusal if self._driver is not None else None
+
     def drive(self, drive: Drive) -> None:
         """Take a position of the stick; raise NeutralFirst if neutral is needed, Refused as the robot's gateway did."""
         self._command(topics.CMD_DRIVE, drive)
@@ -124,8 +129,9 @@ class Pilot:
         self._send_waiting()
 
     def require_neutral(self, why: str) -> None:
-        """Drop the waiting drive; the stick must be centred once, because it may still be deflected."""
-        self._waiting = None
+        """Drop the motion that waits; the stick must be centred once, because it may still be deflected."""
+        if self._waiting is not None and self._waiting[1].moving:
+            self._waiting = None
         self.stick.refused(why)
 
     def release(self) -> None:

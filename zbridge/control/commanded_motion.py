@@ -61,9 +61,11 @@ class CommandedMotion:
             if self.moved:  # a part that moved had no neutral yet: its stick may still be deflected
                 return None
         (parts.add if moving else parts.discard)(part)
-        if stale and parts:  # motion of another part continues, and with it its deadman
+        if moving:
+            return _MOTION
+        if parts:  # motion of another part continues, and so does its deadman
             return None
-        return _MOTION if parts else _STALE_NEUTRAL if stale else _NEUTRAL
+        return _STALE_NEUTRAL if stale else _NEUTRAL
 
     def mode_chosen(self, *, autonomous: bool) -> None:
         """Record that the robot was sent the holder's choice of its mode."""

@@ -7,6 +7,7 @@ import contextlib
 import http.client
 import json
 import socket
+import time
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,8 @@ from zbridge.fleet.messages import Map, Pose, Status
 from zbridge.views.console import api, callers, console, http_server
 from zbridge.views.console.api import OPERATIONS
 from zbridge.views.console.callers import COOKIE
+from zbridge.views.console.journal import Journal
+from zbridge.views.console.rights import Caller
 from zbridge.views.console.users import User, hash_password, new_token, save_users
 
 CONFIRMED = "stopped (their gateways sent it)"
@@ -281,8 +284,9 @@ async def test_what_users_do_is_written_down_with_who_and_what_came_of_it(progra
                 continue
         assert programs.world.gateway.control.holder == "console.operator"
     await asyncio.sleep(0.2)
+    await asyncio.sleep(0.2)
     lines = [(line.get("user", ""), line["action"], line.get("robot"), line["result"]) for line in programs.journal()]
-    assert lines[:7] == [
+    assert lines[:8] == [
         ("viewer", "stop", "r1", "asked"),
         ("viewer", "stop", "r1", "r1 stopped (its gateway sent it)"),
         ("", "login", None, "refused: no such user, or another password"),
@@ -290,8 +294,24 @@ async def test_what_users_do_is_written_down_with_who_and_what_came_of_it(progra
         ("operator", "login", None, "ok"),
         ("operator", "take", "r1", "asked"),
         ("operator", "drive", "r1", "has control"),
+        ("operator", "drive", "r1", "the page was closed or reloaded"),
     ]
     assert all(line["address"] == "127.0.0.1" and line["time"] for line in programs.journal())
+
+
+def test_neither_clocks_nor_others_keep_a_users_lines_out_of_the_journal(monkeypatch: pytest.MonkeyPatch) -> None:
+    lines = list[str]()
+    journal = Journal(lines.append, lambda: 0.0)
+    ann, bob = Caller("ann", "operator", frozenset()), Caller("bob", "operator", frozenset())
+    for _ in range(200):
+        journal.note(bob, "mode none", "r1")
+        journal.note(bob, "login", result="no", refused=True)
+    count = len(lines)
+    assert count == 120
+    monkeypatch.setattr(time, "time_ns", lambda: 0)
+    journal.note(ann, "stop_all", result="asked")
+    assert [json.loads(line)["action"] for line in lines[count:]] == ["stop_all"]
+    assert sum(json.loads(line).get("left_out", 0) for line in lines) == 280
 
 
 async def test_a_user_who_is_removed_is_out_at_once(programs: Lab) -> None:

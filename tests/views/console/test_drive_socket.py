@@ -338,6 +338,62 @@ async def test_a_robot_that_is_driven_stops_before_it_moves_by_itself(scene: Sce
         assert robot.machine.commands[-2:] == [("drive", Drive()), ("mode", Mode("autonomous"))]
 
 
+async def test_a_robot_that_moves_by_itself_is_given_back_for_good(scene: Scene, robot: Gateway) -> None:
+    async with opened(scene) as driver:
+        await by_itself(scene, driver)
+        await driver.say(do="give")
+        await soon(lambda: robot.control.state == "free")
+        await asyncio.sleep(0.5)
+        assert (robot.control.state, driver.control["state"]) == ("free", "none")
+        assert len(robot.questions("acquire")) == 1
+        assert not robot.authority.motion.on_its_own
+
+
+async def test_a_mode_that_the_robot_refuses_is_not_shown_as_in_force(scene: Scene, robot: Gateway) -> None:
+    async with opened(scene) as driver:
+        await driver.take()
+        robot.machine.refusal = "it cannot"
+        await driver.say(do="mode", mode="autonomous")
+        await driver.until(lambda control: "it cannot" in (control["needs"] or control["notice"] or ""))
+        assert driver.control["mode"] == "none"
+
+
+async def test_a_mode_ends_with_what_the_robot_accepts(scene: Scene, robot: Gateway) -> None:
+    async with opened(scene) as driver:
+        await by_itself(scene, driver)
+        robot.publish(topics.STATUS, Status("established", reason="busy", commands=("stop",)))
+        await driver.until(lambda control: control["mode"] == "none")
+
+
+async def test_a_mode_that_is_set_while_the_robot_is_driven_stops_it(scene: Scene, robot: Gateway) -> None:
+    async with opened(scene) as driver:
+        await driver.take()
+        await driver.drive(0.5)
+        await soon(lambda: robot.driven[-1].moving)  # type: ignore[attr-defined]
+        driver.repeats = False
+        await driver.say(do="mode", mode="manual")
+        await soon(lambda: ("mode", Mode("manual")) in robot.machine.commands)
+        assert robot.driven[-1] == Drive()
+
+
+@pytest.mark.parametrize("commands", [("stop", "motor"), ("stop", "drive", "motor")])
+async def test_a_motor_that_is_let_go_is_sent_zero_and_so_is_one_that_another_finger_held(
+    scene: Scene, robot: Gateway, commands: tuple[str, ...]
+) -> None:
+    robot.publish(topics.STATUS, Status("established", commands=commands))
+    await asyncio.sleep(console.REFRESH_S + 0.1)
+    async with opened(scene) as driver:
+        await driver.take()
+        for name in ("arm", "wheel"):
+            driver.command = {"motor": {"name": name, "value": 2.0}}
+            await soon(lambda: (f"motor/{name}", Motor(2.0)) in robot.machine.commands)  # noqa: B023
+        await soon(lambda: robot.machine.commands.count(("motor/arm", Motor(0.0))) == seats.ZEROS)
+        driver.command = {}
+        await soon(lambda: robot.machine.commands.count(("motor/wheel", Motor(0.0))) == seats.ZEROS)
+        await soon(lambda: not robot.authority.motion.parts)
+        assert robot.machine.commands.count(("motor/arm", Motor(0.0))) == seats.ZEROS
+
+
 async def test_a_stop_by_anybody_ends_control_and_says_so(scene: Scene, robot: Gateway) -> None:
     async with opened(scene) as driver:
         await driver.take()

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import gzip
 import json
+import math
 import socket
 from collections.abc import Callable
 from pathlib import Path
@@ -21,7 +22,7 @@ from tests.ports import HOST
 from tests.views.console.conftest import Scene
 from zbridge.errors import ConfigError, LinkError
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Status
+from zbridge.fleet.messages import Pose, Status
 from zbridge.protocol.address import Address
 from zbridge.views.console import console, orders, page, server
 from zbridge.views.console.http_server import listener
@@ -140,6 +141,49 @@ async def test_of_single_robots_the_last_news_are_kept_and_bad_ones_the_longest(
         done = await until(opened, lambda message: all(notice(message, robot).get("good") is False for robot in bad))
     assert [robot for robot in done["notices"] if robot in bad] == sorted(bad)
     assert len(done["notices"]) == console.NOTICES
+
+
+async def test_the_last_news_are_shown_though_all_others_are_bad(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(console, "NOTICES", 1)
+    async with scene.page() as opened:
+        await opened.send(json.dumps({"do": "stop", "robot": "gone"}))
+        await until(opened, lambda message: notice(message, "gone").get("good") is False)
+        await opened.send(json.dumps({"do": "stop", "robot": "r1"}))
+        await until(opened, lambda message: notice(message, "r1").get("good"))
+
+
+async def test_a_second_press_of_one_is_answered_too(scene: Scene) -> None:
+    async with scene.page() as opened:
+        for robot in ("", "r1"):
+            request = {"do": "stop", "robot": robot} if robot else {"do": "stop_all"}
+            for _ in range(2):
+                await opened.send(json.dumps(request))
+            first = await until(opened, lambda message: notice(message, robot))  # noqa: B023
+            at = notice(first, robot)["at"]
+            await until(opened, lambda message: notice(message, robot).get("at", at) > at)  # noqa: B023
+
+
+async def test_a_pose_that_nobody_expects_hides_no_report(scene: Scene) -> None:
+    robot = scene.world.gateways["r1"]
+    async with scene.page() as opened:
+        await opened.send(json.dumps({"do": "stop_all"}))
+        await latched(robot)
+        await asyncio.sleep(0.7)  # it is watched now
+        for heading in (0.0, math.inf):
+            robot.publish(topics.POSE, Pose(0.0, 0.0, heading))
+        done = await until(opened, lambda message: notice(message, "").get("good") is not None)
+    assert "r1 still moves by its own pose or speed" in done["notices"][""]["text"]
+
+
+async def test_an_order_that_fails_says_so(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def fail(*arguments: Any) -> None:
+        raise ZeroDivisionError("nobody knows why")
+
+    monkeypatch.setattr(orders, "stop_fleet", fail)
+    async with scene.page() as opened:
+        await opened.send(json.dumps({"do": "stop_all"}))
+        done = await until(opened, lambda message: notice(message, "").get("good") is False)
+    assert done["notices"][""]["text"].startswith("STOP ALL: this console failed: ")
 
 
 async def test_a_stop_is_sent_however_many_orders_are_under_way(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:

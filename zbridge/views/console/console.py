@@ -62,6 +62,10 @@ class StopNotice(msgspec.Struct, frozen=True):
     good: bool | None = None
 
 
+def _importance(notice: StopNotice) -> tuple[bool, float]:
+    return (notice.good is not True, notice.at)
+
+
 class Console:
     """Everybody who follows the fleet or drives. faults: of the console's own files, by what they hold."""
 
@@ -112,9 +116,10 @@ class Console:
                 await asyncio.sleep(REFRESH_S)
 
     async def close(self) -> None:
-        """Give back all robots, and wait for the orders that are under way."""
+        """Give back all robots, wait for the orders that are under way, and keep who was seen."""
         await self._seats.close()
         await self.orders.close()
+        await asyncio.to_thread(self._roster.save)
 
     # Sockets and streams
 
@@ -209,9 +214,9 @@ class Console:
             self.notices.clear()
         self.notices.pop(robot, None)
         self.notices[robot] = StopNotice(action, text, time.time(), good)
-        single = sorted(filter(None, self.notices), key=lambda each: self.notices[each].good is not True)
-        if len(single) > NOTICES:
-            del self.notices[single[0]]
+        others = sorted(self.notices.keys() - {"", robot}, key=lambda each: _importance(self.notices[each]))
+        if len(others) >= NOTICES:
+            del self.notices[others[0]]
         self._tell(_encode({"notices": self.notices, "now": time.time()}))
 
     # What pages ask for

@@ -92,6 +92,8 @@ class DriveSocket:
         finally:
             self._cancel_timer()
             self._seat.halt("the page was closed or reloaded", moving=self._link.moving)
+            if self._held:
+                self._note("drive", "the page was closed or reloaded")
             self._seats.leave(self._seat)
 
     def _sit(self, seat: Seat) -> None:
@@ -153,7 +155,8 @@ class DriveSocket:
             self._changed.set()
             return
         self._note("take_over" if takeover else "take", "asked")
-        self._seat.take(takeover=takeover)
+        if not self._seats.closed:
+            self._seat.take(takeover=takeover)
 
     def _drive(self, command: PageCommand, now: float) -> None:
         if not self._seat.active:

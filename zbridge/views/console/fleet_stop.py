@@ -129,5 +129,7 @@ def _moves(path: str, first: Sample, last: Sample) -> bool:
         speed = payloads.decode(Motion, last.payload).speed
         return speed is not None and abs(speed) > STILL
     begin, end = payloads.decode(Pose, first.payload), payloads.decode(Pose, last.payload)
+    if not all(map(math.isfinite, (begin.heading, end.heading))):
+        return True  # nobody knows
     turned = math.remainder(end.heading - begin.heading, math.tau)
     return math.hypot(end.x - begin.x, end.y - begin.y) > STILL or abs(turned) > STILL_RAD

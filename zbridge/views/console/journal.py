@@ -12,7 +12,7 @@ from zbridge.views.console.rights import Caller
 
 FILE_BYTES, FILES = 10_000_000, 10
 LINES, REFUSALS = (5.0, 100.0), (0.5, 20.0)
-"""Lines a second, and at once: nobody can rotate older lines away quickly. Further ones are counted."""
+"""Lines a second of one user, and at once: nobody can rotate older lines away quickly. Others are counted."""
 _TEXT = 300
 
 
@@ -20,12 +20,12 @@ class Journal:
     """Writes what was asked for, and what came of it. write: appends a line."""
 
     def __init__(
-        self, write: Callable[[str], None] = lambda line: None, clock_ns: Callable[[], int] = time.time_ns
+        self, write: Callable[[str], None] = lambda line: None, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self._write = write
-        self._clock_ns = clock_ns
-        self._rooms = {False: RateLimit(*LINES), True: RateLimit(*REFUSALS)}
-        """By whether it is a refusal: those of strangers take no room of what users do."""
+        self._clock = clock
+        self._rooms: dict[tuple[str, bool], RateLimit] = {}
+        """By user, and whether it is a refusal: what strangers and others try takes no room of what a user does."""
         self._left_out = 0
 
     def __repr__(self) -> str:
@@ -33,8 +33,9 @@ class Journal:
 
     def note(self, caller: Caller, action: str, robot: str = "", result: str = "", *, refused: bool = False) -> None:
         """Write one line: who, from where, what, of which robot (none: of all), and the result, or why not."""
-        now_ns = self._clock_ns()
-        if not self._rooms[refused].take(now_ns / 1e9):
+        now_ns = time.time_ns()
+        room = self._rooms.setdefault((caller.user, refused), RateLimit(*(REFUSALS if refused else LINES)))
+        if not room.take(self._clock()):
             self._left_out += 1
             return
         fields = {

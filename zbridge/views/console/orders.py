@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Awaitable, Callable
 from typing import Any
 
@@ -10,7 +11,7 @@ from zbridge.bus import Bus
 from zbridge.client.driver import default_who
 from zbridge.client.fleet import Fleet
 from zbridge.client.stops import listed, new_stop, summarize
-from zbridge.errors import RateLimited, ZbridgeError
+from zbridge.errors import RateLimited, ZbridgeError, describe
 from zbridge.fleet.messages import Stop
 from zbridge.views.console.feed import FleetFeed
 from zbridge.views.console.fleet_stop import StopReport, stop_fleet
@@ -19,12 +20,15 @@ from zbridge.views.console.journal import Journal
 from zbridge.views.console.rights import Caller
 from zbridge.views.console.roster import Roster
 
+log = logging.getLogger("zbridge.console")
+
 SAME_PRESS_S = 0.1
 """Seconds within which two presses are one: nobody can have driven the robot in between."""
 ORDERS = 16
 """Most orders of one user under way; a stop of a robot that is known is never refused."""
 RELEASED_S = 1.0
 """Seconds after a release until robots have shown whether they are still latched."""
+_STOPPING_ALL = "STOP ALL is sent; waiting for the gateways to confirm it"
 _TITLES = {"stop_all": "STOP ALL: ", "release": "Release: "}
 
 Order = asyncio.Task[StopReport]
@@ -72,12 +76,12 @@ class Orders:
         """Latch a stop of the fleet, at each press: robots may have been released, and driven, since the last one."""
         if (order := self._same_press("stop_all", "")) is not None:
             self._journal.note(caller, "stop_all", result="asked: pressed again")
+            self._notify("stop_all", "", _STOPPING_ALL, None)
             return order
         for running in self._running:
             if running.get_name() in _TITLES:
                 running.cancel()
-        said = "STOP ALL is sent; waiting for the gateways to confirm it"
-        return self._begin(caller, "stop_all", "", lambda: self._stop_all(caller), said)
+        return self._begin(caller, "stop_all", "", lambda: self._stop_all(caller), _STOPPING_ALL)
 
     def release_all(self, caller: Caller) -> Order:
         """Release the fleet's latched stops, unless that is under way."""
@@ -89,11 +93,12 @@ class Orders:
 
     def stop(self, caller: Caller, robot: str) -> Order:
         """Stop one robot, without a latch; raise RateLimited for too many that nobody knows."""
+        said = f"{robot}: the stop is sent; waiting for its gateway to confirm it"
         if (order := self._same_press("stop", robot)) is not None:
+            self._notify("stop", robot, said, None)
             return order
         if robot not in self._feed.rows:
             self._check_room(caller)
-        said = f"{robot}: the stop is sent; waiting for its gateway to confirm it"
         return self._begin(caller, "stop", robot, lambda: self._stop(caller, robot), said)
 
     def unlatch(self, caller: Caller, robot: str) -> Order:
@@ -140,6 +145,9 @@ class Orders:
             report = await work()
         except ZbridgeError as error:
             report = StopReport(f"{_TITLES.get(action, '')}{error}", good=False)
+        except Exception as error:  # whatever it is, who pressed must know
+            log.exception("%s %s", action, robot)
+            report = StopReport(f"{_TITLES.get(action, '')}this console failed: {describe(error)}", good=False)
         self._journal.note(caller, action, robot, report.text)
         if self._is_newest(asyncio.current_task(), robot):
             self._notify(action, robot, report.text, report.good)

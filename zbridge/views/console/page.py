@@ -148,6 +148,7 @@ class Page:
                 await self._socket.close(_TOO_MANY, f"more than {REQUESTS_HZ:g} requests a second")
                 return
             if not self._is_valid():
+                await self._socket.close(LOGIN_ENDED, "the login has ended")
                 return
             if not request.robot or is_name(request.robot):
                 self._ask(request)

@@ -32,6 +32,8 @@ DEADMAN_S = 0.4
 WAIT_S = 3.0
 """Longest wait for the robot's gateway."""
 RULES = StickRules(advice=": centre the stick first")
+ZEROS = 3
+"""How often a motor is sent 0: a full bus drops commands."""
 _REASON = 300
 
 
@@ -54,8 +56,8 @@ class Seat:
         self._control = partial(fleet[robot].control, who, name=name, deadman_s=DEADMAN_S, wait_s=WAIT_S)
         self._accepts = accepts
         self._pilot: Pilot | None = None
-        self._motor: str | None = None
-        """The motor that was moved last, if it turns until it is sent 0."""
+        self._turning: dict[str, int] = {}
+        """Motors that turn until they are sent 0, and how often they must be sent it."""
         self.autonomous = False
         """Whether the mode autonomous is in force, or was asked for."""
         self._work = Tasks()
@@ -107,10 +109,14 @@ class Seat:
 
         A robot that moves by itself is sent no neutral, which pages repeat all the time; motion stops it.
         """
-        if not self.autonomous:
+        if not self.autonomous or self._pilot is None:
             return self._drive(drive, motor)
         if drive.moving or (motor is not None and motor.value):
             self.halt("the mode was autonomous", moving=True)
+        elif self._pilot.refusal is not None:
+            self.halt(shown(self._pilot.refusal, _REASON), moving=True)
+        elif "mode" not in self._accepts():
+            self.halt(f"{self.robot} accepts no mode now", moving=True)
         return self.held
 
     def _drive(self, drive: Drive, motor: MotorCommand | None = None) -> bool:
@@ -139,17 +145,23 @@ class Seat:
             self._give(pilot, drive, motor)
 
     def _give(self, pilot: Pilot, drive: Drive, motor: MotorCommand | None) -> None:
+        turning = motor.name if motor is not None and motor.value and not motor.linear else None
+        stopping = [name for name in self._turning if name != turning]
+        for name in stopping:
+            pilot.motor(name, 0.0)
+            self._turning[name] -= 1
+            if not self._turning[name]:
+                del self._turning[name]
+        if turning is not None:
+            self._turning[turning] = ZEROS
         if motor is not None:
-            self._motor = motor.name if not motor.linear else None
             pilot.motor(motor.name, motor.value)
         elif "drive" in self._accepts():
             pilot.drive(drive)
-        elif self._motor is not None and not drive.moving:
-            pilot.motor(self._motor, 0.0)
-        elif not drive.moving:
-            pilot.rest()
-        else:
+        elif drive.moving:
             raise NotReady(f"{self.robot} accepts no drive now")
+        elif not stopping:
+            pilot.rest()
 
     def halt(self, why: str, *, moving: bool) -> None:
         """Require neutral. moving: whether the robot may move now: it is sent neutral then."""
@@ -171,8 +183,7 @@ class Seat:
     def set_mode(self, mode: str) -> None:
         """Set who moves the robot. What moves it until now ends."""
         if self.held and self._pilot is not None:
-            if mode == "autonomous":
-                self._drive(Drive())
+            self._drive(Drive())
             self.autonomous = mode == "autonomous"
             self._work.start(self._set_mode(self._pilot, mode))
 
@@ -183,6 +194,8 @@ class Seat:
             await self._pilot.close()
 
     async def _set_mode(self, pilot: Pilot, mode: str) -> None:
+        if not pilot.stick.held:  # it was given back, or lost: nobody acquires it again by this
+            return
         try:
             await pilot.set_mode(mode)
         except ZbridgeError as error:
@@ -201,6 +214,7 @@ class Seats:
     """All seats whose pages are there, or may come back."""
 
     def __init__(self) -> None:
+        self.closed = False
         self._seated: set[Seat] = set()
         self._waiting: dict[Seat, asyncio.TimerHandle] = {}
         self._work = Tasks()
@@ -242,20 +256,21 @@ class Seats:
         """Note that the socket of a seat has ended: it waits for its page, if it holds the lease."""
         self._seated.discard(seat)
         seat.changed = lambda: None
-        if not seat.held or len(self._waiting) >= SEATS:
+        if not seat.held or self.closed or len(self._waiting) >= SEATS:
             self._work.start(seat.close())
             return
         self._waiting[seat] = asyncio.get_running_loop().call_later(RELOAD_S, self._give_up, seat)
 
     async def close(self) -> None:
-        """Give back all leases."""
+        """Give back all leases, and let nobody sit down any more."""
+        self.closed = True
         for timer in self._waiting.values():
             timer.cancel()
         await asyncio.gather(*(seat.close() for seat in self), *self._work.running, return_exceptions=True)
         self._waiting.clear()
 
     def _give_up(self, seat: Seat) -> None:
-        del self._waiting[seat]
+        self._waiting.pop(seat, None)
         self._work.start(seat.close())
 
 

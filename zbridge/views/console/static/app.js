@@ -10,6 +10,7 @@ const AGAIN_MS = 1000;
 
 let scheduled = false;
 let store = null;
+const lost = []; // what is said of stops that were not answered before the login ended
 let Robot = null; // loaded with the first page of a robot: the fleet is painted sooner
 
 async function loadRobot() {
@@ -41,22 +42,33 @@ function namedRobot() {
 }
 
 function begin(me) {
+  lost.length = 0;
   render(null, document.body); // nothing of a page belongs to the store before
   store = new Store(draw, me, start);
   draw();
 }
 
-// Asks who this page acts for, at the beginning and whenever its login may have ended.
+// Asks who this page acts for, at the beginning and whenever its login may have ended. What became of the stops that
+// were pressed before, and are not answered, stays in sight.
 async function start() {
+  for (const { alarm } of store?.stops.values() ?? []) if (alarm) lost.push(alarm.text);
   store?.close();
   store = null;
+  render(html`<${Nobody} lost=${lost} />`, document.body);
   try {
     const me = await whoAmI();
     if (me) begin(me);
-    else render(html`<${Login} done=${begin} />`, document.body);
+    else render(html`<${Nobody} lost=${lost} /><${Login} done=${begin} />`, document.body);
   } catch {
     setTimeout(start, AGAIN_MS);
   }
+}
+
+function Nobody({ lost }) {
+  return html`<div role="alert" class="nobody">
+    <p class="notice">Not connected: STOP ALL and Escape do nothing on this page.</p>
+    ${lost.map((text) => html`<p class="notice bad">${text}</p>`)}
+  </div>`;
 }
 
 addEventListener("hashchange", draw);

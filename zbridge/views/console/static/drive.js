@@ -49,6 +49,7 @@ export class Drive {
     this.token = null;
     this.socket?.close();
     this.socket = null;
+    this.wakeLock?.release();
   }
 
   get held() {
@@ -179,6 +180,7 @@ export class Drive {
     this.socket = null;
     this.control = { ...NONE, notice: "The connection to the console was lost: the robot is stopped." };
     this.roundTrip = null;
+    this.wakeLock?.release();
     this.changed();
     if (!mayResume || performance.now() / 1000 - this.lostAt > RESUME_S) return;
     this.token = mayResume;
@@ -230,8 +232,7 @@ export class Drive {
   // A new epoch makes the server wait for neutral: after regained focus, a slow connection, other gamepads.
   noteChanges() {
     const blocked = this.blocked;
-    if (this.wasBlocked && !blocked) this.begin(this.wasBlocked);
-    if (blocked && !this.wasBlocked && this.control.mode === "autonomous") this.setMode("none"); // nobody watches it
+    if (blocked !== this.wasBlocked) this.begin(this.wasBlocked || blocked); // it also ends the mode autonomous
     this.wasBlocked = blocked;
     if (this.inputs.pads.changes !== this.padChanges) {
       this.padChanges = this.inputs.pads.changes;

@@ -136,19 +136,22 @@ function Gamepad({ drive }) {
 function Mode({ drive, robot }) {
   const [asked, ask] = useState(false);
   const { mode } = drive.control;
-  const set = (wanted) => (event) => {
+  const choose = (wanted) => (event) => {
     leave(event);
-    ask(wanted === "autonomous" && !asked);
-    if (wanted !== "autonomous" || asked) drive.setMode(wanted);
+    ask(wanted === "autonomous");
+    if (wanted !== "autonomous") drive.setMode(wanted);
   };
-  const cancel = () => ask(false);
+  const answer = (yes) => () => {
+    ask(false);
+    if (yes) drive.setMode("autonomous");
+  };
   return html`<h3>Mode</h3>
     <div class="switch" role="group" aria-label="Mode">
-      ${MODES.map((each) => html`<button type="button" aria-pressed=${mode === each} onClick=${set(each)}>${each}</button>`)}
+      ${MODES.map((each) => html`<button type="button" aria-pressed=${mode === each} onClick=${choose(each)}>${each}</button>`)}
     </div>
     ${asked && html`<p class="question">${robot} then moves by itself.
-      <button type="button" class="careful" onClick=${set("autonomous")}>Set autonomous</button>
-      <button type="button" onClick=${cancel}>Cancel</button></p>`}`;
+      <button type="button" class="careful" onClick=${answer(true)}>Set autonomous</button>
+      <button type="button" onClick=${answer(false)}>Cancel</button></p>`}`;
 }
 
 // Single motors move while their buttons are held.

@@ -18,7 +18,7 @@ export const NEUTRAL = Object.freeze({ forward: 0, left: 0, turn: 0 });
 export const isNeutral = ({ forward, left, turn }) => !forward && !left && !turn;
 
 // The keys that are held. A key counts from a press that the page received while it had the focus.
-export class Keyboard {
+class Keyboard {
   constructor() {
     this.held = new Set();
   }
@@ -46,7 +46,7 @@ export class Keyboard {
 }
 
 // The stick on the page: a knob that one pointer drags.
-export class PageStick {
+class PageStick {
   constructor() {
     this.pointer = null;
     this.at = { x: 0, y: 0 }; // right and up, -1 to 1
@@ -77,7 +77,7 @@ export class PageStick {
 }
 
 // The gamepad that was moved last. changes: rises when pads come or go, or a dead one is alive again.
-export class Gamepads {
+class Gamepads {
   constructor() {
     this.changes = 0;
     this.known = "";

@@ -5,7 +5,6 @@ import { Drive } from "./drive.js";
 import { DrivePanel } from "./drive_panel.js";
 import { Plots, readValues } from "./plots.js";
 import { Facts, History, Published, Refusals, Sensors, Sessions, Switches, Texts } from "./panels.js";
-import { RobotData } from "./robot_data.js";
 import { Scene } from "./scene.js";
 import { doubtOf, driverOf, leave, span, toneOf, whyOf, wordOf } from "./words.js";
 

@@ -66,6 +66,7 @@ export class Store {
   }
 
   connect() {
+    if (this.closed) return;
     const socket = (this.socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/socket`));
     socket.onopen = () => {
       this.tries = 0;
@@ -117,9 +118,17 @@ export class Store {
   takeNotices(notices, now) {
     for (const [robot, notice] of Object.entries(notices)) notices[robot] = { ...notice, came: performance.now() - 1000 * (now - notice.at) };
     this.notices = notices;
-    for (const { robot, request, before } of this.stops.values()) {
-      if (notices[robot]?.action === request.do && notices[robot].at !== before) this.drop(robot);
-    }
+    for (const stop of this.stops.values()) this.compare(stop, notices[stop.robot]);
+  }
+
+  // Whether a notice tells of a stop that was pressed here, and whether it is the last word on it.
+  compare(stop, notice) {
+    if (!notice || notice.came < stop.at) return;
+    const answers = notice.action === stop.request.do;
+    if (answers && notice.good === null) {
+      clearTimeout(stop.timer);
+      Object.assign(stop, { heard: true, alarm: null });
+    } else if (answers || stop.heard) this.drop(stop.robot);
   }
 
   sample() {
@@ -157,7 +166,7 @@ export class Store {
     this.drop(robot);
     this.warning = null;
     const request = robot ? { do: "stop", robot } : { do: "stop_all" };
-    const stop = { robot, request, at: performance.now(), before: this.notices[robot]?.at, alarm: null };
+    const stop = { robot, request, at: performance.now(), heard: false, alarm: null };
     this.stops.set(robot, stop);
     this.sendStop(stop);
   }

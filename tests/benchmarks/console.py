@@ -26,6 +26,8 @@ from tests.browser.conftest import CHROMIUM, chromium
 
 CPU_GOAL, PAINT_GOAL_S, GROWTH_GOAL = 15.0, 0.6, 5.0
 """Per cent of a core; seconds; per cent of memory in an hour."""
+STEP_S = 300
+"""Seconds between two readings of memory."""
 PAINTS = 10
 STALL_S = 20.0
 SETTLE_S = 5.0
@@ -134,16 +136,18 @@ def measure_paint(console: ConsoleProcess) -> bool:
 
 def measure_hours(console: ConsoleProcess, robots: int, hours: float) -> bool:
     with process("tests.benchmarks.console_pages", console.at, CHURNING, robots, "churn") as looking:
+        ends = time.monotonic() + 3600 * hours
         for _ in range(60):
             looking.hear()
-        first = memory_mb(console.pid)
-        ends = time.monotonic() + 3600 * hours
-        while time.monotonic() < ends:
-            for _ in range(300):
+        print(f"{memory_mb(console.pid):.1f} MB after a minute", flush=True)
+        found = []
+        while time.monotonic() < ends or len(found) < 2:
+            for _ in range(STEP_S):
                 last = looking.hear()
-            print(f"{memory_mb(console.pid):.1f} MB, {last['pages']} pages came and went", flush=True)
-        growth = 100 * (memory_mb(console.pid) / first - 1)
-    print(f"memory: {first:.1f} MB after a minute, {growth:+.1f} % after {hours:g} h (goal {GROWTH_GOAL:g} %)")
+            found.append(memory_mb(console.pid))
+            print(f"{found[-1]:.1f} MB, {last['pages']} pages came and went", flush=True)
+        growth = 100 * (max(found) / found[0] - 1)  # before, the allocator still fills its arenas
+    print(f"memory: at most {growth:+.1f} % of that after six minutes, in {hours:g} h (goal {GROWTH_GOAL:g} %)")
     return growth <= GROWTH_GOAL
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 import pytest_asyncio
 
-from tests.browser.conftest import Browser, soon
+from tests.browser.conftest import Browser, pushed, soon
 from tests.client import Gateway, World
 from tests.views.console.serving import served
 from zbridge.fleet import topics
@@ -69,6 +69,11 @@ class Lane:
     async def moves(self, forward: float = LIMIT, left: float = 0.0, turn: float = 0.0) -> None:
         """Wait until the robot is driven so."""
         await soon(lambda: self.last == Drive(forward=forward, left=left, turn=turn), 5.0)
+
+    async def press(self, page: Any, key: str = "w", forward: float = LIMIT) -> None:
+        """Hold a key until it drives the robot."""
+        keyboard = page.keyboard
+        await pushed(page, lambda: keyboard.down(key), lambda: keyboard.up(key), lambda: self.moves(forward))
 
     async def stops(self, within_s: float = 5.0) -> None:
         await soon(lambda: not self.last.moving, within_s)
@@ -138,8 +143,7 @@ async def test_a_stick_that_was_deflected_when_control_was_taken_must_be_centred
 
 async def test_space_stops_the_robot_and_clicks_no_button_again(lane: Lane) -> None:
     page = await lane.driver()
-    await page.keyboard.down("w")
-    await lane.moves()
+    await lane.press(page)
     stops = lane.robot.machine.stops
     await page.keyboard.press("Space")
     await soon(lambda: lane.robot.machine.stops > stops)
@@ -164,8 +168,7 @@ async def test_space_stops_wherever_the_focus_is_and_once_for_each_press(lane: L
 )
 async def test_a_key_whose_release_the_page_may_not_hear_counts_no_longer(lane: Lane, event: str) -> None:
     page = await lane.driver()
-    await page.keyboard.down("w")
-    await lane.moves()
+    await lane.press(page)
     await page.evaluate(f"dispatchEvent({event})")
     await lane.stays()
 
@@ -286,8 +289,7 @@ async def test_a_gamepad_that_is_gone_and_comes_back_deflected_moves_nothing(lan
 
 async def test_without_the_focus_nothing_moves_and_a_key_must_be_pressed_anew(lane: Lane) -> None:
     page = await lane.driver()
-    await page.keyboard.down("w")
-    await lane.moves()
+    await lane.press(page)
     await page.evaluate("document.hasFocus = () => false")
     await lane.stops(1.0)
     await page.get_by_text("this page does not have the focus").wait_for()
@@ -296,8 +298,7 @@ async def test_without_the_focus_nothing_moves_and_a_key_must_be_pressed_anew(la
     await lane.stays()
     await page.keyboard.up("w")
     await page.get_by_text("Ready.").wait_for()
-    await page.keyboard.down("w")
-    await lane.moves()
+    await lane.press(page)
 
 
 async def test_a_gamepad_that_is_still_pushed_when_the_focus_returns_must_be_centred(lane: Lane) -> None:
@@ -319,8 +320,7 @@ async def test_keys_that_are_pressed_without_the_focus_are_discarded(lane: Lane)
 
 async def test_a_hidden_page_moves_nothing(lane: Lane) -> None:
     page = await lane.driver()
-    await page.keyboard.down("w")
-    await lane.moves()
+    await lane.press(page)
     await page.evaluate("Object.defineProperty(document, 'hidden', {value: true, configurable: true})")
     await page.evaluate("document.dispatchEvent(new Event('visibilitychange'))")
     await lane.stops(1.0)
@@ -329,8 +329,7 @@ async def test_a_hidden_page_moves_nothing(lane: Lane) -> None:
 
 async def test_a_closed_tab_stops_the_robot_and_gives_it_back(lane: Lane) -> None:
     page = await lane.driver()
-    await page.keyboard.down("w")
-    await lane.moves()
+    await lane.press(page)
     await page.close()
     await lane.stops(1.0)
     await soon(lambda: lane.robot.control.state == "free", 5.0)
@@ -338,8 +337,7 @@ async def test_a_closed_tab_stops_the_robot_and_gives_it_back(lane: Lane) -> Non
 
 async def test_another_page_of_the_console_gives_the_robot_back(lane: Lane) -> None:
     page = await lane.driver()
-    await page.keyboard.down("w")
-    await lane.moves()
+    await lane.press(page)
     await page.evaluate("location.hash = ''")
     await lane.stops(1.0)
     await soon(lambda: lane.robot.control.state == "free", 1.0)
@@ -348,8 +346,7 @@ async def test_another_page_of_the_console_gives_the_robot_back(lane: Lane) -> N
 async def test_a_reloaded_page_has_its_control_back_and_waits_for_neutral(lane: Lane) -> None:
     page = await lane.driver()
     holder = lane.robot.control.holder
-    await page.keyboard.down("w")
-    await lane.moves()
+    await lane.press(page)
     await page.reload()
     await lane.stops(1.0)
     await page.get_by_text("You drive r1").wait_for()
@@ -358,8 +355,7 @@ async def test_a_reloaded_page_has_its_control_back_and_waits_for_neutral(lane: 
     await lane.stays()
     await page.keyboard.up("w")
     await page.get_by_text("Ready.").wait_for()
-    await page.keyboard.down("w")
-    await lane.moves()
+    await lane.press(page)
 
 
 async def test_a_copied_tab_does_not_get_the_control(lane: Lane) -> None:
@@ -413,8 +409,7 @@ async def test_a_stalled_connection_stops_the_robot_and_its_burst_moves_nothing(
     await page.route_web_socket("**/drive/*", wire)
     await page.get_by_role("button", name="Take control").click()
     await page.get_by_text("Ready.").wait_for()
-    await page.keyboard.down("w")
-    await lane.moves()
+    await lane.press(page)
     setattr(wire, direction, False)
     await lane.stops(1.5)
     await asyncio.sleep(1.0)
@@ -424,8 +419,7 @@ async def test_a_stalled_connection_stops_the_robot_and_its_burst_moves_nothing(
     await page.get_by_text("connection to this page").wait_for()
     await page.keyboard.up("w")
     await page.get_by_text("Ready.").wait_for()
-    await page.keyboard.down("w")
-    await lane.moves()
+    await lane.press(page)
 
 
 async def test_a_cut_connection_stops_the_robot_and_control_comes_back_with_neutral(lane: Lane) -> None:
@@ -434,8 +428,7 @@ async def test_a_cut_connection_stops_the_robot_and_control_comes_back_with_neut
     await page.route_web_socket("**/drive/*", wire)
     await page.get_by_role("button", name="Take control").click()
     await page.get_by_text("Ready.").wait_for()
-    await page.keyboard.down("w")
-    await lane.moves()
+    await lane.press(page)
     await wire.cut()
     await lane.stops(1.0)
     await page.get_by_text("You drive r1").wait_for()
@@ -469,8 +462,7 @@ async def frozen(page: Any, chromium: Any) -> list[int]:
 
 async def test_a_frozen_renderer_stops_the_robot_and_its_key_counts_no_longer(lane: Lane) -> None:
     page = await lane.driver()
-    await page.keyboard.down("w")
-    await lane.moves()
+    await lane.press(page)
     pids = await frozen(page, page.context.browser)
     try:
         for pid in pids:
@@ -483,14 +475,12 @@ async def test_a_frozen_renderer_stops_the_robot_and_its_key_counts_no_longer(la
     await lane.stays(1.0)
     await page.keyboard.up("w")
     await page.get_by_text("Ready.").wait_for()
-    await page.keyboard.down("w")
-    await lane.moves()
+    await lane.press(page)
 
 
 async def test_a_second_browser_is_refused_sees_by_whom_and_may_take_over(lane: Lane) -> None:
     first = await lane.driver()
-    await first.keyboard.down("w")
-    await lane.moves()
+    await lane.press(first)
     second = await lane.browser.open(ROBOT)
     await second.get_by_text("console.browser1 drives").first.wait_for()
     await second.get_by_role("button", name="Take control").click()
@@ -502,8 +492,7 @@ async def test_a_second_browser_is_refused_sees_by_whom_and_may_take_over(lane: 
     await second.get_by_text("Ready.").wait_for()
     await first.get_by_text("held by console.browser2").wait_for()
     await lane.stays()
-    await second.keyboard.down("s")
-    await lane.moves(-LIMIT)
+    await lane.press(second, "s", -LIMIT)
 
 
 async def test_who_drives_by_another_program_refuses_the_page(lane: Lane) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.browser.conftest import Browser
+from tests.browser.conftest import Browser, pushed
 from tests.browser.rooms import Room, configured, console, room, simulated
 from tests.e2e.conftest import Bench, Gateway, listener, repeated, until
 from tests.e2e.rigs.ros2_scene import RosScene
@@ -30,26 +30,31 @@ async def test_keys_stick_and_gamepad_drive_a_robot_and_letting_go_stops_it(
         page = await scene.browser.open(ROBOT)
         await page.get_by_role("button", name="Take control").click()
         await page.get_by_text("Ready.").wait_for()
-        await page.keyboard.down("w")
-        await scene.moves()
-        await page.keyboard.up("w")
+        keyboard = page.keyboard
+        await pushed(page, lambda: keyboard.down("w"), lambda: keyboard.up("w"), scene.moves)
+        await keyboard.up("w")
         await scene.rests()
-        stick = page.get_by_label("Stick: drag to drive")
-        await stick.hover()
-        await page.mouse.down()
-        box = await stick.bounding_box()
-        await page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"])
-        await scene.moves()
+        await pushed(page, lambda: drag(page), page.mouse.up, scene.moves)
         await page.mouse.up()
         await scene.rests()
         pad = "{index: 0, id: 'pad', connected: true, timestamp: 1, axes: [0, 0], buttons: []}"
         await page.evaluate(f"window.pad = {pad}; navigator.getGamepads = () => [window.pad]")
         await page.get_by_text("pad: drives").wait_for()
         await page.get_by_text("Ready.").wait_for()
-        await page.evaluate("window.push = setInterval(() => { pad.axes = [0, -1]; pad.timestamp += 1; }, 50)")
-        await scene.moves()
-        await page.evaluate("clearInterval(push)")
+        await page.evaluate("window.along = 0; setInterval(() => { pad.axes = [0, along]; pad.timestamp += 1; }, 50)")
+        push, let_go = (lambda along=along: page.evaluate(f"window.along = {along}") for along in (-1, 0))
+        await pushed(page, push, let_go, scene.moves)
+        await let_go()
         await scene.rests()
+
+
+async def drag(page: Any) -> None:
+    """Pull the stick on the page back."""
+    stick = page.get_by_label("Stick: drag to drive")
+    await stick.hover()
+    await page.mouse.down()
+    box = await stick.bounding_box()
+    await page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"])
 
 
 async def takes_over(scene: Room, other: str) -> Any:
@@ -62,9 +67,9 @@ async def takes_over(scene: Room, other: str) -> Any:
     await page.get_by_role("button", name="Take over").click()
     await page.get_by_text("Ready.").wait_for()
     await scene.rests(1.0)
-    await page.keyboard.down("s")
-    await scene.moves()
-    await page.keyboard.up("s")
+    keyboard = page.keyboard
+    await pushed(page, lambda: keyboard.down("s"), lambda: keyboard.up("s"), scene.moves)
+    await keyboard.up("s")
     await scene.rests()
     return page
 

@@ -47,7 +47,12 @@ def test_the_example_passes_its_tests_and_is_driven_by_tcp_and_on_a_serial_line(
     shutil.copytree(EXAMPLE / "tests", tmp_path / "tests")
     shutil.copy(EXAMPLE / "pyproject.toml", tmp_path)
     tests = str(tmp_path / "tests")
-    assert "passed" in run("pytest", "-q", "-p", "no:cacheprovider", "--rootdir", str(tmp_path), tests)
+    command = (sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--rootdir", str(tmp_path), tests)
+    for _ in range(3):  # a busy machine may pause a test for longer than its deadman
+        ran = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+        if "NeutralFirst" not in ran.stdout:
+            break
+    assert ran.returncode == 0, ran.stdout
 
 
 @pytest.mark.parametrize("protocol", ["khepera", "alf", "tcpudp", "wc2ec"])

@@ -17,7 +17,10 @@ def run_program(bench: Bench, page: str) -> list[str]:
     (program,) = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), re.DOTALL)
     bench.serve(bench.simulator(), robot="tcpudp1")
     program = program.replace("tcp/127.0.0.1:7447", bench.endpoint)
-    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=30, check=False)
+    for _ in range(3):  # a busy machine may pause it for longer than its deadman
+        ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=30, check=False)
+        if "NeutralFirst" not in ran.stderr:
+            break
     assert ran.returncode == 0, ran.stderr
     poses = bench.fleet.seen["fleet/tcpudp1/pose"]
     assert abs(poses[-1]["y"] - poses[0]["y"]) > 0.3

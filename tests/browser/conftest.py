@@ -32,7 +32,7 @@ PICTURES = os.environ.get("ZBRIDGE_PICTURES")
 """A folder in which each page that a test photographs is kept."""
 ARGUMENTS = ("--no-sandbox", "--disable-quic", "--disable-background-networking", "--disable-component-update")
 WIDE, NARROW = {"width": 1200, "height": 700}, {"width": 360, "height": 740}
-AT_ONCE = 3
+AT_ONCE = 2
 _READS_BACK = "Canvas2D: Multiple readback operations"
 
 

@@ -40,8 +40,8 @@ LEASE_S, DEADMAN_S = 0.4, 0.15
 GRANTS = {"acquired", "taken over"}
 ENDS = {"released", "ended"}
 WRITTEN = {"acquire": "acquired", "takeover": "taken over", "release": "released"}
-SLACK_S = 0.1
-"""Seconds by which clocks of one machine, read in several processes, may disagree when it is busy."""
+SLACK_S = 0.3
+"""Seconds by which several processes of one machine, when it is busy, may differ about when something was."""
 _NUMBERS = 100
 """Commands with a value of their own that one lease may carry; SCALE / 100 leases a driver."""
 

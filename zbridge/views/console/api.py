@@ -28,7 +28,7 @@ from zbridge.views.console.rights import Action, Caller
 BODY_BYTES = 4096
 BODY_S = 10.0
 """Longest time that the body of a request may take."""
-REFUSED_S = 0.1
+REFUSED_S = 0.2
 """How long a refused login waits for its answer."""
 STREAM_S = 2.0
 """Longest wait for the next message of a stream."""

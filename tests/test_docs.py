@@ -78,7 +78,11 @@ def test_every_file_that_is_named_exists(page: Path) -> None:
 
 def test_the_page_of_the_architecture_names_every_room() -> None:
     rooms = {f"`{path.parent.relative_to(ROOT)}/`" for path in ROOT.glob("zbridge/*/__init__.py")}
-    named = set(re.findall(r"^\| (`zbridge/\w+/`) \|", (ROOT / "docs" / "architecture.md").read_text(), re.MULTILINE))
+    named = set(
+        re.findall(
+            r"^\| (`zbridge/\w+/`) \|", (ROOT / "docs" / "explanation" / "architecture.md").read_text(), re.MULTILINE
+        )
+    )
     assert named == rooms
 
 
@@ -111,8 +115,10 @@ def test_every_command_that_is_named_exists_with_its_options(page: Path) -> None
 
 
 def documented_keys() -> Iterator[str]:
-    """Give each key of ``docs/keys.md`` as a path below the robot; the second and later of a row continue the first."""
-    for row in re.findall(r"^\| (`fleet/r1/[^|]+) \|", (ROOT / "docs" / "keys.md").read_text(), re.MULTILINE):
+    """Give each key of ``docs/reference/keys.md`` as a path below the robot; the second and later of a row continue the first."""
+    for row in re.findall(
+        r"^\| (`fleet/r1/[^|]+) \|", (ROOT / "docs" / "reference" / "keys.md").read_text(), re.MULTILINE
+    ):
         first, *others = (key.removeprefix("fleet/r1/") for key in SPAN.findall(row))
         head = re.sub(r"[^/]+(/<\w+>)?$", "", first)
         yield from (first, *(head + other for other in others))

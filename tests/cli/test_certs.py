@@ -16,7 +16,7 @@ import pytest
 from zbridge import cli
 from zbridge.security.roles import Member, load_roles
 
-PAGE = Path(__file__).parents[2] / "docs" / "security.md"
+PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "secure-bus.md"
 RESTART = "Restart the router, which reads roles.toml when it starts. That loses the bus: every driven robot stops.\n"
 
 

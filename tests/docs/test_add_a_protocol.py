@@ -10,7 +10,7 @@ from zbridge.fleet import topics
 
 DOCS = Path(__file__).parents[2] / "docs"
 EXAMPLE = DOCS / "examples" / "khepera"
-GUIDE = (DOCS / "add-a-protocol.md").read_text()
+GUIDE = (DOCS / "how-to" / "add-a-protocol.md").read_text()
 LISTINGS = re.findall(r"^```(?:python|toml) (\S+)\n(.*?)^```$", GUIDE, re.DOTALL | re.MULTILINE)
 FILES = ("pyproject.toml", *(str(path.relative_to(EXAMPLE)) for path in sorted((EXAMPLE / "khepera").glob("*.py"))))
 MOST_LINES = 250

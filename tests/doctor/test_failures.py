@@ -1,4 +1,4 @@
-"""Each documented failure, broken on a bus of its own, and doctor's verdict: the table of ``docs/doctor.md``."""
+"""Each documented failure, broken on a bus of its own, and doctor's verdict: the table of ``docs/how-to/troubleshoot.md``."""
 
 from __future__ import annotations
 
@@ -30,7 +30,11 @@ from zbridge.fleet.messages import Control, Refusal
 from zbridge.fleet.processes import DiskSpace, SessionEntry, Stats
 
 pytestmark = pytest.mark.jumping
-PAGE = (Path(__file__).parents[2] / "docs" / "doctor.md").read_text().partition("## Documented failures")[2]
+PAGE = (
+    (Path(__file__).parents[2] / "docs" / "how-to" / "troubleshoot.md")
+    .read_text()
+    .partition("## Documented failures")[2]
+)
 ROWS = re.findall(r"^\| ([^|]+) \| [^|]+ \| (?:anywhere|host|silence) \|$", PAGE, re.MULTILINE)
 
 

@@ -13,7 +13,7 @@ from zbridge.errors import Code
 from zbridge.protocol.plugin import find_protocol, protocol_names
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs" / "doctor.md").read_text()
+PAGE = (ROOT / "docs" / "how-to" / "troubleshoot.md").read_text()
 MAKERS = {"error", "note", "warning", "ok", "Finding"}
 STATES = ("offline", "connecting", "handshaking", "closing")
 
@@ -69,4 +69,4 @@ def test_the_failures_name_codes_that_there_are() -> None:
 )
 def test_the_failures_of_the_first_table_of_what_happens_are_on_the_page(failure: str) -> None:
     assert failure in PAGE
-    assert failure in (ROOT / "docs" / "what-happens.md").read_text()
+    assert failure in (ROOT / "docs" / "explanation" / "failures.md").read_text()

@@ -1,4 +1,4 @@
-"""What ``docs/console.md`` shows to programs, run as it stands there against a console with users."""
+"""What ``docs/how-to/console.md`` shows to programs, run as it stands there against a console with users."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tests.e2e.conftest import HOST, Bench, start, until
 
-PAGE = (Path(__file__).parents[2] / "docs" / "console.md").read_text()
+PAGE = (Path(__file__).parents[2] / "docs" / "how-to" / "console.md").read_text()
 SECTION = PAGE.partition("## For programs")[2].partition("\n## ")[0]
 
 

@@ -1,4 +1,4 @@
-"""The programs of README and ``docs/keys.md``, run as they stand (only the router's address is the test's)."""
+"""The programs of README and ``docs/reference/keys.md``, run as they stand (only the router's address is the test's)."""
 
 from __future__ import annotations
 
@@ -37,4 +37,4 @@ def test_the_readmes_client_drives(bench: Bench) -> None:
 
 
 def test_the_plain_program_of_the_keys_page_prints_poses_and_drives(bench: Bench) -> None:
-    assert len([eval(line) for line in run_program(bench, "docs/keys.md")]) > 10
+    assert len([eval(line) for line in run_program(bench, "docs/reference/keys.md")]) > 10

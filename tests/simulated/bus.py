@@ -4,7 +4,7 @@ Theory of operation. Each session is linked to one router, the routers to each o
 A message goes from link to link. Order holds for one publisher and one key. A router knows the tokens of its sessions
 and those that the other router told it; news of tokens travel as messages, and may be late besides. What happened to a
 link is known at each of its ends at its own time. ``python -m tests.simulated.bus_validation`` compares all of this
-with real Zenoh; docs/reliability.md says what was measured.
+with real Zenoh; docs/explanation/reliability.md says what was measured.
 """
 
 from __future__ import annotations

@@ -294,7 +294,7 @@ class DriverMember(Member):
         else:
             await drive(**{way: sign * value})
 
-    # A client of its own, as docs/keys.md describes it: no liveliness token, and dates only where asked to
+    # A client of its own, as docs/reference/keys.md describes it: no liveliness token, and dates only where asked to
 
     async def _drive_raw(self, step: dict[str, Any]) -> None:
         assert self.bus is not None

@@ -27,7 +27,7 @@ DISTURBS = frozenset(
 """What the trace says of faults."""
 TICK_S = 0.1
 REST_S = 1.5
-"""Longest time to rest, once the robot and its link work; docs/what-happens.md."""
+"""Longest time to rest, once the robot and its link work; docs/explanation/failures.md."""
 TOLD_S = 0.25
 """Longest time until ``control`` shows news."""
 HEARTBEAT_S = 2.5
@@ -95,7 +95,9 @@ class Obligations:
             self._connected_at = self.world.now
         if what == "connected":
             grant = self.checker.current.get(self.checker.by_host.get(fields[0][0], ""))
-            if grant is not None:  # a robot that was lost is stopped when it comes back: docs/control.md
+            if (
+                grant is not None
+            ):  # a robot that was lost is stopped when it comes back: docs/explanation/who-may-drive.md
                 grant.autonomous = False
         elif what in ("drops", "ignores"):
             self._dropped_at = self.world.now
@@ -272,7 +274,7 @@ class Obligations:
         """Datagrams that are lost, and robots that lose the stops of the first second, where no more are sent."""
         if self.simulation.robot.by_itself and self.serving not in self.checker.know_mode:
             self.checker.counts["excused: the gateway never met one that knew of the mode"] += 1
-            return float("inf")  # docs/what-happens.md: it was cut off since before the mode was chosen
+            return float("inf")  # docs/explanation/failures.md: it was cut off since before the mode was chosen
         if self.simulation.scenario.get("control", {}).get("idle_stop_s") == 0:
             return float("inf") if self._dropped_at >= 0 else 0.0
         return 0.0

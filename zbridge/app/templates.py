@@ -88,7 +88,7 @@ tls = { ca = "{name}-bus/ca.pem", certificate = "{name}-bus/certificate.pem", ke
 
 """
 CAMERA_TEMPLATE = """\
-# [camera]                              # the robot streams pictures (MJPEG by HTTP): docs/camera.md
+# [camera]                              # the robot streams pictures (MJPEG by HTTP): docs/how-to/camera.md
 # url = "http://192.168.0.10:8000/stream.mjpg"  # fetched only while somebody watches
 # rate_hz = 30.0                        # most pictures a second on the bus
 # stall_s = 5.0                         # a stream without a picture for so long is ended, and fetched anew

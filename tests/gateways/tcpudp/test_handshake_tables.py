@@ -10,7 +10,7 @@ import pytest
 
 from gateways.tcpudp.session import hq_role, robot_role
 
-PAGE = (Path(__file__).parents[3] / "docs/protocols/tcpudp.md").read_text()
+PAGE = (Path(__file__).parents[3] / "docs/reference/protocols/tcpudp.md").read_text()
 
 
 def rendered(table: Mapping[Any, Mapping[Any, tuple[Any, Any]]]) -> str:

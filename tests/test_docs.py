@@ -115,7 +115,7 @@ def test_every_command_that_is_named_exists_with_its_options(page: Path) -> None
 
 
 def documented_keys() -> Iterator[str]:
-    """Give each key of ``docs/reference/keys.md`` as a path below the robot; the second and later of a row continue the first."""
+    """Give each key of ``keys.md`` as a path below the robot; the second and later of a row continue the first."""
     for row in re.findall(
         r"^\| (`fleet/r1/[^|]+) \|", (ROOT / "docs" / "reference" / "keys.md").read_text(), re.MULTILINE
     ):

@@ -1,4 +1,4 @@
-"""Each documented failure, broken on a bus of its own, and doctor's verdict: the table of ``docs/how-to/troubleshoot.md``."""
+"""Each documented failure, broken on a bus of its own, and doctor's verdict: the table of ``troubleshoot.md``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What ``docs/how-to/console.md`` shows to programs, run as it stands there against a console with users."""
+"""What ``console.md`` shows to programs, run as it stands there against a console with users."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The programs of README and ``docs/reference/keys.md``, run as they stand (only the router's address is the test's)."""
+"""The programs of README and ``keys.md``, run as they stand (only the router's address is the test's)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which lines of the readers the corpus reaches: a table for ``docs/explanation/reliability.md``."""
+"""Which lines of the readers the corpus reaches: a table for ``reliability.md``."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ def _shown(name: str, by: str | None) -> bool:
 
 
 def _print_cells(cells: Counter[tuple[str, str, str]]) -> None:
-    """Print how often each cell of the tables in ``docs/explanation/who-may-drive.md`` was executed."""
+    """Print how often each cell of the tables in ``state-tables.md`` was executed."""
     for kind in (Authority, LeaseClient, Intent):
         every = [(state.value, said.value) for state, row in kind.TABLE.items() for said in row]
         reached = [cell for cell in every if cells[kind.__name__, *cell]]

@@ -1,4 +1,4 @@
-"""The bounded worlds that are searched. What is not in any of them is said in ``docs/explanation/reliability.md``."""
+"""The bounded worlds that are searched. What is not in any of them is said in ``reliability.md``."""
 
 from tests.search.moves import Bounds
 from tests.search.world import Program

@@ -1,1 +1,1 @@
-"""Deterministic simulation of whole gateways: one process, one heap of events, one seed. See docs/explanation/reliability.md."""
+"""Deterministic simulation of whole gateways: one process, one heap of events, one seed. See reliability.md."""

@@ -1,4 +1,4 @@
-"""Which rows of the tables of ``docs/explanation/who-may-drive.md`` and ``docs/explanation/failures.md`` a run reached, and how often.
+"""Which rows of the tables of ``who-may-drive.md`` and ``failures.md`` a run reached, and how often.
 
 The tables of the machines are what the code executes: each is replaced by one that counts its inputs. The other rows
 are counted by what the checker saw.
@@ -48,7 +48,7 @@ EVENTS = {
     "the other one leaves a moving robot": "a gateway left a moving robot to another one",
     "the owner is gone, and the other one serves the robot": "a gateway was left alone",
 }
-"""The rows of ``docs/explanation/failures.md`` that the simulation has, and what counts them."""
+"""The rows of ``failures.md`` that the simulation has, and what counts them."""
 
 
 class _Row(dict[Any, Any]):

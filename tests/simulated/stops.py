@@ -1,7 +1,7 @@
 """Rules about stops: those that are reported, those that are repeated, and those that have to wait.
 
-Source: "The latched stop" in ``docs/explanation/who-may-drive.md``, "When the robot's program or its link stalls" and the silence after
-packet 4 in ``docs/explanation/failures.md``.
+Source: "The latched stop" in ``who-may-drive.md``, "When the robot's program or its link stalls" and the silence after
+packet 4 in ``failures.md``.
 """
 
 from __future__ import annotations

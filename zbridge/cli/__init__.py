@@ -8,7 +8,7 @@ rich. ``app`` declares the commands; ``certs``, ``doctor``, ``robot_commands`` a
 of them. ``bus``, ``check``, ``demo`` (with ``demo_bus``), ``diagnosis``, ``drive``, ``echo``, ``gateway_commands``,
 ``probe``, ``recording``, ``router``, ``supervise``, ``top`` and ``viewers`` implement them; ``terminal`` prints lines
 and tables. ``keyboard`` converts keys to drives; ``fork_server`` forks the gateways of ``zbridge run DIR``. Exit codes:
-``docs/reference/commands.md``.
+``commands.md``.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The table of the authority: what each input does in each state of the right to drive. Sans-IO.
 
 The machine is :attr:`AuthorityMachine.TABLE`, ``{state: {input: (action, next state)}}``, at the foot of the class;
-``docs/explanation/who-may-drive.md`` shows the same table, and a test compares both. A pair that the table lacks changes nothing. An
+``state-tables.md`` shows the same table, and a test compares both. A pair that the table lacks changes nothing. An
 action that raises Refused has changed nothing, and the state stays.
 
 States. FREE and STOPPED: nobody has the lease (they differ in what people are shown). HELD: a program has the lease

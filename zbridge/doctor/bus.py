@@ -79,7 +79,7 @@ def judge_unreachable(settings: BusSettings, fault: BusError) -> Finding:
     """Judge why the bus could not be joined."""
     where = ", ".join(settings.connect) or "any peer"
     if isinstance(fault, BusRefused):
-        return error(Layer.BUS, "bus_refused", str(fault), 'see docs/how-to/secure-bus.md, "Why a connection fails"')
+        return error(Layer.BUS, "bus_refused", str(fault), 'see docs/how-to/troubleshoot.md, "Why a connection fails"')
     return error(
         Layer.BUS, "bus_unreachable", f"no bus at {where}: {fault}", "start the router; check its address and firewalls"
     )
@@ -112,7 +112,7 @@ async def examine_role(bus: Bus, settings: BusSettings, realm: str, robot: str |
             layer,
             "no_whoami",
             f"no router says what {certificate.common_name} may do: one of Zenoh's own does not answer",
-            "compare its access rules with docs/how-to/secure-bus.md: what they deny looks like silence",
+            "compare its access rules with docs/reference/roles.md: what they deny looks like silence",
         )
         return iter([unknown])
     offset_s, uncertainty_s = asked.offset_s(member.stamp_ns)

@@ -1,7 +1,7 @@
 """The lease as a program holds it: asks for it, renews it, proves commands, notices its loss. Sans-IO.
 
 Theory of operation. The machine is :attr:`LeaseClient.TABLE`, ``{state: {input: (action, next state)}}``;
-``docs/explanation/who-may-drive.md`` shows the same table, and a test compares both. A pair that the table lacks changes nothing.
+``state-tables.md`` shows the same table, and a test compares both. A pair that the table lacks changes nothing.
 
 States. FREE: no lease and no question. ASKING: an ``acquire`` awaits its answer. PAUSED: the gateway could not answer;
 the question is repeated soon. DROPPED: an ``acquire`` awaits its answer, but the program no longer wants the lease.

@@ -1,8 +1,8 @@
 """A stick: turns its positions into lease, neutral, drives and stops. Sans-IO.
 
 Theory of operation. Somebody repeats what the stick of an HQ program, a ROS publisher, a Foxglove viewer or a keyboard
-says. The machine is :attr:`Stick.TABLE`, ``{state: {input: (action, next state)}}``; ``docs/explanation/who-may-drive.md`` shows the same
-table, and a test compares both. Six states: idle, or the lease is being asked for, or held; and each of these may need
+says. The machine is :attr:`Stick.TABLE`, ``{state: {input: (action, next state)}}``; ``state-tables.md`` shows the
+same table, and a test compares both. Six states: idle, or the lease is being asked for, or held; and each of these may need
 neutral. A stick that needs neutral moves nothing before it was centred once: a stick that was left deflected must not
 start a robot that was stopped or lost.
 

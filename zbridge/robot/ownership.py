@@ -4,7 +4,7 @@ A claim is an answered query (:class:`~zbridge.robot.claim.Claim`). The liveline
 that there may be another gateway; without a claim behind it, it means nothing.
 
 Theory of operation. The machine is :attr:`Ownership.TABLE`, ``{state: {input: (action, next state)}}``;
-``docs/explanation/who-may-drive.md`` shows the same table, and a test compares both. The gateway awaits :meth:`Ownership.take`, then
+``state-tables.md`` shows the same table, and a test compares both. The gateway awaits :meth:`Ownership.take`, then
 runs :meth:`Ownership.watch` beside its device, and calls :meth:`Ownership.release` at its end.
 
 LOOKING: other gateways are looked for. One look that finds none is enough at the start; :data:`LOOKS` in a row after a

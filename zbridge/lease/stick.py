@@ -2,9 +2,9 @@
 
 Theory of operation. Somebody repeats what the stick of an HQ program, a ROS publisher, a Foxglove viewer or a keyboard
 says. The machine is :attr:`Stick.TABLE`, ``{state: {input: (action, next state)}}``; ``state-tables.md`` shows the
-same table, and a test compares both. Six states: idle, or the lease is being asked for, or held; and each of these may need
-neutral. A stick that needs neutral moves nothing before it was centred once: a stick that was left deflected must not
-start a robot that was stopped or lost.
+same table, and a test compares both. Six states: idle, or the lease is being asked for, or held; and each of these may
+need neutral. A stick that needs neutral moves nothing before it was centred once: a stick that was left deflected must
+not start a robot that was stopped or lost.
 
 The caller tells :meth:`Stick.heard`, then :meth:`Stick.motion` or :meth:`Stick.neutral`, and must carry out the
 :class:`StickAction` they return. It calls :meth:`Stick.granted`, :meth:`Stick.lost`, :meth:`Stick.released` and

@@ -1,10 +1,8 @@
-"""What the pages name exists: links, files, modules, commands with their options, keys; and no key is left out."""
+"""What the pages name exists: links, files, modules, commands with their options."""
 
 import contextlib
 import pkgutil
 import re
-from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -12,8 +10,6 @@ import typer.main
 from typer.core import TyperGroup
 
 from zbridge.cli.app import app
-from zbridge.fleet import topics
-from zbridge.fleet.topics import Topic
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(
@@ -112,29 +108,3 @@ def test_every_command_that_is_named_exists_with_its_options(page: Path) -> None
         known = {option for parameter in command.params for option in parameter.opts}
         unknown = set(re.findall(r"--[a-z-]+", rest.partition("#")[0].partition("&&")[0])) - known
         assert not unknown, f"zbridge {name} {rest}"
-
-
-def documented_keys() -> Iterator[str]:
-    """Give each key of ``keys.md`` as a path below the robot; the second and later of a row continue the first."""
-    for row in re.findall(
-        r"^\| (`fleet/r1/[^|]+) \|", (ROOT / "docs" / "reference" / "keys.md").read_text(), re.MULTILINE
-    ):
-        first, *others = (key.removeprefix("fleet/r1/") for key in SPAN.findall(row))
-        head = re.sub(r"[^/]+(/<\w+>)?$", "", first)
-        yield from (first, *(head + other for other in others))
-
-
-def test_the_page_of_keys_names_every_key_and_no_other() -> None:
-    listed = Counter(documented_keys())
-    assert [path for path, count in listed.items() if count > 1] == [], "one key, one row"
-    documented = {re.sub(r"<\w+>$", "name", path) for path in listed}
-    found = {
-        path: topics.find(path) for path in documented if not path.startswith(("@wire/", "@alive/", "@rpc/claim/"))
-    }
-    assert [path for path, topic in found.items() if topic is None] == []
-    declared = {topic.path for topic in vars(topics).values() if isinstance(topic, Topic)}
-    assert declared - documented == set()
-    families = {
-        topic("").path.rpartition("/")[0] for name, topic in vars(topics).items() if name.isupper() and callable(topic)
-    }
-    assert families - {path.rpartition("/")[0] for path in documented} == set()

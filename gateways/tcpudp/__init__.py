@@ -50,7 +50,7 @@ unasked = false                         # maps and positions (53, 55) also to pr
                                         # (52, 54): its first ones have no handlers for them
 skip_map_flag = false                   # leave out the byte that some 1.3 programs skip, so that they see the map size
 slam_map_size = 1000                    # announced while the robot's map is not known yet, in its unit of length
-slam_map_interval = 10
+slam_map_interval = 10                  # the side of its cells, likewise
 speed_full = 1.0                        # packet speed at full scale
 turn_full = 1.0                         # packet turn speed at full scale
 length_unit_m = 0.01                    # the programs' unit of length in metres

@@ -28,7 +28,7 @@ motor_types = { rotational = [53], linear = [46] }  # type bytes that are motors
 # bounds = { front = [-1.0, 5000.0] }   # others for some sensors
 # tables = { front = [[0.0, 1.0], [1000.0, 0.02]] }  # from a sensor's value to metres (or irradiance), interpolated
 # bearings_deg = { front = 0.0, left = 90.0 }  # directions of distance sensors, counter-clockwise: they make a scan
-# scan_range_m = [0.0, 10.0]
+# scan_range_m = [0.0, 10.0]            # least and most distance that the scan reports
 # devices = [{ name = "light0", number = 0 }]  # draft only: the devices there are, kind = "light" by default
 # pinned = ["light0"]                   # draft only: sensors that measure though nobody listens
 # values = 3                            # draft only: configuration values of a sensor
@@ -53,8 +53,8 @@ join_s = 0.03                           # a controller sets "left" and "right" o
 sectors = 8                             # a scan is shown as so many distance sensors, sector0 ahead, counter-clockwise
 sector_unit_m = 1.0                     # what their value 1 is in metres
 distance_type = 37                      # type bytes; they move with the Webots version
-rotational_type = 53
-linear_type = 46
+rotational_type = 53                    # likewise
+linear_type = 46                        # likewise
 # devices = [{ name = "light0", number = 0 }]  # draft only: the sensors there are, by their names on the bus
 values = 3                              # draft only: configuration values of a sensor
 

@@ -20,7 +20,10 @@ Number = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
 
 
 class DeviceOption(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A device of the draft dialect, which has no names on the wire."""
+    """A device of the draft dialect, which has no names on the wire.
+
+    name: on the bus. number: on the wire. kind: of the device.
+    """
 
     name: str
     number: Byte
@@ -28,7 +31,10 @@ class DeviceOption(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class WheelMotors(Differential, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Two sides of wheels, by the names of their motors."""
+    """Two sides of wheels: how a drive moves the robot.
+
+    left, right: the names of their motors. wheel_radius_m: of the wheels.
+    """
 
     left: tuple[str, ...]
     right: tuple[str, ...]
@@ -36,14 +42,20 @@ class WheelMotors(Differential, frozen=True, forbid_unknown_fields=True, kw_only
 
 
 class MotorTypes(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Type bytes that are motors."""
+    """Type bytes that are motors.
+
+    rotational, linear: of these motors.
+    """
 
     rotational: tuple[Byte, ...] = (53,)
     linear: tuple[Byte, ...] = (46,)
 
 
 class MotorNames(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Names that are motors, whatever their type byte."""
+    """Names that are motors, whatever their type byte.
+
+    rotational, linear: of these motors.
+    """
 
     rotational: tuple[str, ...] = ()
     linear: tuple[str, ...] = ()
@@ -96,7 +108,10 @@ def require_devices(dialect: str, devices: tuple[DeviceOption, ...]) -> None:
 
 
 class Wheels(Differential, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The two sides of wheels that are shown of a robot without motors."""
+    """The motors "left" and "right" that are shown of a robot without motors.
+
+    wheel_radius_m: of the wheels. track_m: between the sides.
+    """
 
     wheel_radius_m: Positive = 0.05
     track_m: Positive = 0.3

@@ -279,7 +279,7 @@ def test_an_interruption_ends_a_command_without_a_traceback(early: bool) -> None
 
 
 def test_help_says_the_exit_codes_that_the_page_lists(zbridge: Typed) -> None:
-    page = (ROOT / "docs" / "reference" / "commands.md").read_text().partition("### Exit codes")[2].partition("## ")[0]
+    page = (ROOT / "docs" / "reference" / "commands.md").read_text().partition("## Exit codes")[2].partition("\n## ")[0]
     own = re.findall(r"^\| `(\w+)` \|", page, re.MULTILINE)
     assert len(own) > 5
     commands = built(app).commands  # type: ignore[attr-defined]

@@ -34,7 +34,10 @@ _VARIABLE = re.compile(r"\$\{(\w+)\}")
 
 
 class RobotSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """``[robot]``: the robot's name on the bus, and the first chunk of its keys."""
+    """``[robot]``: the robot on the bus.
+
+    name: of the robot. realm: the first chunk of its keys.
+    """
 
     name: str
     realm: str = "fleet"

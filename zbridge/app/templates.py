@@ -64,14 +64,14 @@ allow = []                              # networks that clients may connect from
 ROBOT_TEMPLATE = """\
 [robot]
 name = "{name}"                         # its keys begin with fleet/{name}/
-realm = "fleet"
+realm = "fleet"                         # the first chunk of all keys of this fleet
 
 """
 BUS_TEMPLATE = """\
 [bus]
 mode = "peer"                           # peer, client, router (embedded); client when only connect is given
 connect = []                            # for example ["tcp/127.0.0.1:7447"]
-listen = []
+listen = []                             # where other programs may connect: ["tcp/0.0.0.0:7447"]
 multicast = true                        # find peers on the local network
 stream = "drop"                         # "block": no loss when the bus is slower than the robot
 # tls = { ... }                         # a secure bus: put the [bus] table of `zbridge certs bundle` here instead

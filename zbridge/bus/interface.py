@@ -28,7 +28,10 @@ six sessions never reconnected after 4 of 33 cuts of the network (eclipse-zenoh/
 
 
 class Tls(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Files for mutual TLS: the authority's certificate, our own and its key."""
+    """Files for mutual TLS.
+
+    ca: the authority's certificate. certificate: our own. key: of our certificate.
+    """
 
     ca: str
     certificate: str | None = None

@@ -103,7 +103,9 @@ def issue(
 
 @app.command()
 def renew(
-    names: Annotated[list[str] | None, typer.Argument(metavar="[NAME]...", show_default=False)] = None,
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="[NAME]...", show_default=False, help="names to renew; or --all")
+    ] = None,
     every: Annotated[bool, typer.Option("--all", help="every name in roles.toml")] = False,
     days: Days = 365,
     directory: Directory = Path("certs"),
@@ -161,7 +163,9 @@ def revoke(name: Name, directory: Directory = Path("certs")) -> None:
 @app.command()
 def bundle(
     name: Name,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FOLDER", show_default=False)],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="FOLDER", show_default=False, help="the folder to write")
+    ],
     connect: Annotated[
         list[str] | None,
         typer.Option(help="Zenoh endpoint of a router, tls/HOST:PORT; by default the routers issued here, port 7447"),

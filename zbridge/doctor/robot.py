@@ -154,7 +154,7 @@ def _judge_refusal(refusal: Refusal) -> Finding:
     who = refusal.who or "somebody"
     times = "once" if refusal.count == 1 else f"{refusal.count} times"
     text = f"since the gateway started {who} was refused {refusal.command} {times}: {refusal.reason}"
-    return note(Layer.DRIVING, f"refused_{refusal.code}", text, _REFUSED.get(refusal.code))
+    return note(Layer.DRIVING, f"refused_{refusal.code}", text, REMEDIES.get(refusal.code))
 
 
 def judge_listeners(listeners: Iterable[ListenerStats], host: str) -> Iterator[Finding]:
@@ -263,7 +263,7 @@ _DISK = {
     "audit": "make room: events are lost until then, robots are served all the same",
     "latches": "make room: a latched stop, or mode autonomous, cannot be kept through a restart",
 }
-_REFUSED: dict[str, str] = {
+REMEDIES: dict[str, str] = {
     Code.HELD: "somebody else has the lease: wait, ask with a higher priority, or take over",
     Code.NO_LEASE: "acquire the lease before driving",
     Code.LEASE_ENDED: "the lease has ended (a stop, a takeover, an expiry): acquire it anew",

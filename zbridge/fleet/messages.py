@@ -43,7 +43,11 @@ class FleetMessage(msgspec.Struct, frozen=True, gc=False, kw_only=True):
 
 
 class Scan(FleetMessage, frozen=True, eq=False):
-    """One sweep of a laser scanner. ranges: float32[n], metres, invalid = NaN; angles in radians."""
+    """One sweep of a laser scanner, or of distance sensors.
+
+    angle_min, angle_increment: radians. range_min, range_max: metres. ranges: float32[n], metres; NaN where nothing was
+    measured.
+    """
 
     angle_min: float
     angle_increment: float
@@ -53,7 +57,11 @@ class Scan(FleetMessage, frozen=True, eq=False):
 
 
 class Scanner(FleetMessage, frozen=True):
-    """The geometry of a laser scanner: radians, seconds, metres."""
+    """The geometry of a laser scanner.
+
+    angle_min, angle_max, angle_increment: radians. time_increment_s: from one point to the next. range_min, range_max:
+    metres. points: of a sweep.
+    """
 
     angle_min: float
     angle_max: float
@@ -65,9 +73,9 @@ class Scanner(FleetMessage, frozen=True):
 
 
 class Motion(FleetMessage, frozen=True):
-    """How the robot moves: speed -1..1 of full scale, acceleration m/s2, gyro rad/s, temperature degrees C.
+    """How the robot moves; None = unknown.
 
-    acceleration and gyro are [x, y, z]; unknown = None.
+    speed: -1 to 1 of full scale. acceleration: [x, y, z], m/s2. gyro: [x, y, z], rad/s. temperature: degrees C.
     """
 
     speed: float | None = None
@@ -77,7 +85,10 @@ class Motion(FleetMessage, frozen=True):
 
 
 class Pose(FleetMessage, frozen=True):
-    """Where the robot is in its own map frame: metres, heading in radians."""
+    """Where the robot is in its own map frame.
+
+    x, y: metres. heading: radians.
+    """
 
     x: float
     y: float
@@ -85,9 +96,10 @@ class Pose(FleetMessage, frozen=True):
 
 
 class Map(FleetMessage, frozen=True, eq=False):
-    """An occupancy map. cells: uint8[rows, columns], row = y, 0 unknown, 1 free, 2 occupied.
+    """An occupancy map.
 
-    cell: side of a cell in metres. origin: [x, y] of cell (0, 0) in metres.
+    rows, columns: of cells. cell: side of a cell in metres. origin: [x, y] of cell (0, 0) in metres. cells: uint8[rows,
+    columns], row = y, 0 unknown, 1 free, 2 occupied.
     """
 
     rows: int
@@ -98,7 +110,10 @@ class Map(FleetMessage, frozen=True, eq=False):
 
 
 class Image(FleetMessage, frozen=True):
-    """One compressed picture of the robot's camera. format: ``jpeg`` or ``png``; pixels, None = unknown."""
+    """One compressed picture of the robot's camera.
+
+    format: ``jpeg`` or ``png``. data: the bytes of the file. width, height: pixels, None = unknown.
+    """
 
     format: str
     data: bytes
@@ -107,7 +122,11 @@ class Image(FleetMessage, frozen=True):
 
 
 class Battery(FleetMessage, frozen=True):
-    """The robot's battery. level: 0 (empty) to 1; V, A (negative: it is being emptied). None = unknown."""
+    """The robot's battery; None = unknown.
+
+    level: 0 (empty) to 1. voltage: V. current: A, negative while it is being emptied. charging: whether it is being
+    charged.
+    """
 
     level: float | None = None
     voltage: float | None = None
@@ -116,7 +135,11 @@ class Battery(FleetMessage, frozen=True):
 
 
 class Reading(FleetMessage, frozen=True):
-    """One value of a named sensor, in the sensor's unit. fault: the value is not plausible."""
+    """One value of a named sensor.
+
+    value: in the sensor's unit. kind: what sort of sensor it is. device: its number in the device table. fault: the
+    value is not plausible.
+    """
 
     value: float
     kind: str | None = None
@@ -125,7 +148,11 @@ class Reading(FleetMessage, frozen=True):
 
 
 class Device(msgspec.Struct, frozen=True):
-    """One entry of the device table."""
+    """One entry of the device table.
+
+    name: in keys, ``sensor/<name>``. number: the robot's own for it. kind: what it is, ``distance`` or ``rotational
+    motor``.
+    """
 
     name: str
     number: int
@@ -133,19 +160,29 @@ class Device(msgspec.Struct, frozen=True):
 
 
 class Devices(FleetMessage, frozen=True):
-    """The devices that the robot has registered."""
+    """The devices that the robot has registered.
+
+    devices: in the order of their registration.
+    """
 
     devices: tuple[Device, ...]
 
 
 class Switch(FleetMessage, frozen=True):
-    """A switch that is on or off."""
+    """A switch.
+
+    on: whether it is on.
+    """
 
     on: bool
 
 
 class Text(FleetMessage, frozen=True):
-    """A text for people. kind ``request``: asks programs on the bus for something."""
+    """A text for people.
+
+    text: what it says. kind: ``request`` asks programs on the bus for something. sender: who wrote it, if that is
+    known.
+    """
 
     text: str
     kind: Literal["debug", "chat", "request"] = "debug"
@@ -153,7 +190,10 @@ class Text(FleetMessage, frozen=True):
 
 
 class Raw(FleetMessage, frozen=True):
-    """A legacy message that no fleet message holds: its packet id and its body."""
+    """A legacy message that no fleet message holds.
+
+    id: of the packet. body: its bytes.
+    """
 
     id: int
     body: bytes = b""
@@ -162,7 +202,8 @@ class Raw(FleetMessage, frozen=True):
 class LinkStatus(msgspec.Struct, frozen=True):
     """One transport connection to the robot.
 
-    shared: gateways of other robots may connect to the same address; left out where they may not.
+    name: of the link, ``robot``. state: as of the robot. peer: its address. reason: why it is not established. shared:
+    gateways of other robots may connect to the same address; left out where they may not.
     """
 
     name: str
@@ -176,10 +217,12 @@ RobotState = Literal["offline", "connecting", "handshaking", "established", "clo
 
 
 class Status(FleetMessage, frozen=True):
-    """Whether the robot can be used, and what was negotiated with it. host: the machine of its gateway.
+    """Whether the robot can be used, and what was negotiated with it.
 
-    stalled: True while the robot's link acknowledges nothing: what it is sent waits.
-    commands: what the robot accepts now: ``stop``, ``drive``, ``light``, ``motor``; whoever holds the robot or not.
+    state: of the robot. reason: why it is not established, or what is wrong with it. protocol, dialect, version: that
+    it speaks. features: that both sides use. links: to the robot. host: the machine of its gateway. stalled: True while
+    the robot's link acknowledges nothing: what it is sent waits. commands: what the robot accepts now: ``stop``,
+    ``drive``, ``light``, ``motor``; whoever holds the robot or not.
     """
 
     state: RobotState
@@ -195,9 +238,11 @@ class Status(FleetMessage, frozen=True):
 
 
 class Refusal(msgspec.Struct, frozen=True, kw_only=True):
-    """A command that was not carried out, and how often. code: a :class:`zbridge.errors.Code`, for programs.
+    """A command that was not carried out, and how often.
 
-    by: the listener that refused it, ``hq.<listener>``; None if the robot's gateway did.
+    who: sent it, by its proof or the name in its key; None if neither shows it. command: what was refused. code: a
+    :class:`zbridge.errors.Code`, for programs. reason: for people. count: how often. by: the listener that refused it,
+    ``hq.<listener>``; None if the robot's gateway did.
     """
 
     who: str | None
@@ -209,7 +254,10 @@ class Refusal(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Latch(msgspec.Struct, frozen=True):
-    """A latched stop. who and reason are what its sender said. fleet: it was sent to all robots of the realm."""
+    """A latched stop.
+
+    id: releases it. who, reason: what its sender said. fleet: it was sent to all robots of the realm.
+    """
 
     id: StopId
     who: str | None = None
@@ -224,9 +272,11 @@ class Latch(msgspec.Struct, frozen=True):
 
 
 class Control(FleetMessage, frozen=True):
-    """Who drives, and what was refused lately. lease: the public id of the current lease.
+    """Who drives, and what was refused lately.
 
-    latches: the latched stops in force. stops: the ids of the last stops that had one.
+    state: of the lease. holder: the name of who has it. lease: the public id of the current lease. priority: that it
+    was asked for with. expires_in_s: unless it is renewed. refusals: the last different ones, newest last. latches: the
+    latched stops in force. stops: the ids of the last stops that had one.
     """
 
     state: Literal["free", "held", "stopped", "latched"]
@@ -240,13 +290,20 @@ class Control(FleetMessage, frozen=True):
 
 
 class Refusals(FleetMessage, frozen=True):
-    """A listener's report of what it refused its HQ programs; the robot's gateway shows it on ``control``."""
+    """A listener's report of what it refused its HQ programs; the robot's gateway shows it on ``control``.
+
+    refusals: as ``control`` shows them.
+    """
 
     refusals: Annotated[tuple[Refusal, ...], msgspec.Meta(max_length=TOLD)]
 
 
 class Drive(FleetMessage, frozen=True):
-    """Move: fractions of full scale, -1..1. light: None leaves it unchanged."""
+    """Move, or stand still with the lease kept: all zero is neutral.
+
+    forward: of full scale. left: sideways, of full scale. turn: counter-clockwise, of full scale. light: None leaves it
+    unchanged.
+    """
 
     forward: Fraction = 0.0
     left: Fraction = 0.0
@@ -260,7 +317,10 @@ class Drive(FleetMessage, frozen=True):
 
 
 class Motor(FleetMessage, frozen=True):
-    """One motor: rad/s, or metres for a linear motor."""
+    """One motor.
+
+    value: rad/s, or metres for a linear motor.
+    """
 
     value: Finite
 
@@ -271,16 +331,19 @@ class Motor(FleetMessage, frozen=True):
 
 
 class Mode(FleetMessage, frozen=True):
-    """Who moves the robot: nobody (none), a person (manual) or the robot itself (autonomous)."""
+    """Who moves the robot.
+
+    mode: nobody (none), a person (manual) or the robot itself (autonomous).
+    """
 
     mode: Literal["none", "manual", "autonomous"]
 
 
 class Stop(FleetMessage, frozen=True):
-    """Stop now. Anybody may send it.
+    """Stop now. Anybody may send it. What cannot be read is a stop without any of these fields.
 
-    id: ``control`` shows it once the stop was carried out. latch: nobody drives until this id is released. who, reason:
-    for people. What cannot be read is a stop without any of these.
+    latch: nobody drives until this id is released. id: ``control`` shows it once the stop was carried out. who, reason:
+    for people.
     """
 
     latch: bool | UnsetType = UNSET
@@ -290,20 +353,29 @@ class Stop(FleetMessage, frozen=True):
 
 
 class Unlatch(FleetMessage, frozen=True):
-    """Release one latched stop."""
+    """Release one latched stop.
+
+    id: of the stop.
+    """
 
     id: StopId
 
 
 class FleetLatches(FleetMessage, frozen=True):
-    """What one gateway knows of the fleet's latched stops: those in force, and the ids released last."""
+    """What one gateway knows of the fleet's latched stops.
+
+    latches: those in force. released: the ids released last.
+    """
 
     latches: tuple[Latch, ...] = ()
     released: tuple[StopId, ...] = ()
 
 
 class SensorSetting(FleetMessage, frozen=True):
-    """Settings of one sensor: any of ``enable``, one ``value`` by ``index``, all ``values``."""
+    """Settings of one sensor: any of them.
+
+    enable: whether it measures. index: of ``value``. value: one setting. values: all settings.
+    """
 
     enable: bool | None = None
     index: int | None = None
@@ -319,9 +391,9 @@ class Acquire(FleetMessage, frozen=True):
     """Ask for the lease of a robot, or take it over.
 
     who: the name that others are shown. priority: a higher priority gets the lease of a holder with a lower one.
-    lease_s, deadman_s: requested times in seconds, capped by the robot's configuration; None: its default.
-    alive: the ``<who>`` of a liveliness token below the robot's ``@alive/``; its loss ends the lease.
-    t: the sender's CLOCK_MONOTONIC_RAW, ms; absent where the sender does not date its commands.
+    lease_s, deadman_s: requested times, capped by the robot's configuration; None: its default. alive: the ``<who>`` of
+    a liveliness token below the robot's ``@alive/``; its loss ends the lease. t: the sender's CLOCK_MONOTONIC_RAW, ms;
+    absent where the sender does not date its commands.
     """
 
     who: str
@@ -335,9 +407,10 @@ class Acquire(FleetMessage, frozen=True):
 class Lease(FleetMessage, frozen=True):
     """The answer to every query about the lease.
 
-    lease: its public id, 8 bytes. token: 32 secret bytes for the holder, never sent again. Both only where the lease is
-    granted. code: a :class:`zbridge.errors.Code` where it is refused, for programs. max_age_s: what is later than that
-    is stale, in seconds; where it is given, commands and renewals must be dated.
+    ok: whether it is granted. lease: its public id. token: secret, for the holder, never sent again; both only where
+    the lease is granted. expires_in_s: unless it is renewed. holder: who has it. reason: of a refusal, for people.
+    code: a :class:`zbridge.errors.Code` where it is refused, for programs. max_age_s: what is later than that is stale;
+    where it is given, commands and renewals must be dated.
     """
 
     ok: bool
@@ -353,8 +426,11 @@ class Lease(FleetMessage, frozen=True):
 class Authorization(FleetMessage, frozen=True):
     """Shows that a command, or a query about the lease, is the holder's: see :mod:`zbridge.lease.proof`.
 
-    Attachment of a command; payload of ``renew`` and ``release``. seq: rises with each command (query) of the lease.
-    t: the sender's CLOCK_MONOTONIC_RAW when the command was given, ms; absent where the sender does not date it.
+    Attachment of a command; payload of ``renew`` and ``release``.
+
+    lease: its public id. seq: rises with each command (query) of the lease. proof: HMAC of key, number, time and
+    payload. t: the sender's CLOCK_MONOTONIC_RAW when the command was given, ms; absent where the sender does not date
+    it.
     """
 
     lease: LeaseId
@@ -364,7 +440,10 @@ class Authorization(FleetMessage, frozen=True):
 
 
 class Denied(FleetMessage, frozen=True):
-    """The error reply to a query. code: a :class:`zbridge.errors.Code`, for programs; reason: for people."""
+    """The error reply to a query.
+
+    code: a :class:`zbridge.errors.Code`, for programs. reason: for people.
+    """
 
     code: str
     reason: str

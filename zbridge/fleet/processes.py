@@ -9,7 +9,10 @@ from zbridge.fleet.messages import FleetMessage
 
 
 class Membership(FleetMessage, frozen=True):
-    """What a router knows of the member that asks: its name, its role, and the robots that it names."""
+    """What a router knows of the member that asks.
+
+    name, role: in ``roles.toml``. robots: that it is for; empty: as its role says.
+    """
 
     name: str
     role: str
@@ -17,9 +20,12 @@ class Membership(FleetMessage, frozen=True):
 
 
 class SessionEntry(msgspec.Struct, frozen=True):
-    """One session of the table: with a robot's link (our role: ``hq``) or with an HQ program (our role: ``robot``).
+    """One session of the table, with a robot's link or with an HQ program.
 
-    counters: frames and bytes carried, lost and refused. left_out: counts of what has no form on the other side.
+    name: of the session. peer: its address. role: ours, ``hq`` towards a robot, ``robot`` towards an HQ program. state:
+    of the session. reason: why it ended, or is not established. version: of the protocol. features: that both sides
+    use. transport: of its frames. counters: frames and bytes carried, lost and refused. left_out: counts of what has no
+    form on the other side.
     """
 
     name: str
@@ -37,10 +43,10 @@ class SessionEntry(msgspec.Struct, frozen=True):
 class ProcessStats(msgspec.Struct, frozen=True):
     """One process, and what it uses of its machine.
 
-    version: of zbridge. robots: how many it serves. uptime_s: seconds since it started. cpu: processors in use, 0.02 is
-    two hundredths of one, over the last seconds. resident_bytes: with all shared pages; proportional_bytes: each shared
-    page divided among those that share it; None where the platform does not say. files: open descriptors, of at most
-    most_files. late_s: by how much the event loop was late in the last second.
+    host: its machine. pid: its process id. version: of zbridge. robots: how many it serves. uptime_s: since it started.
+    cpu: processors in use, 0.02 is two hundredths of one, over the last seconds. resident_bytes: with all shared pages.
+    proportional_bytes: each shared page divided among those that share it; None where the platform does not say. files:
+    open descriptors. most_files: how many it may have. late_s: by how much the event loop was late in the last second.
     """
 
     host: str
@@ -57,7 +63,11 @@ class ProcessStats(msgspec.Struct, frozen=True):
 
 
 class ListenerStats(msgspec.Struct, frozen=True):
-    """One listener for HQ programs. name: on the bus, without ``hq.``. listening: whether it accepts connections."""
+    """One listener for HQ programs.
+
+    name: on the bus, without ``hq.``. protocol: of its programs. address: where they connect. clients: connected now.
+    listening: whether it accepts connections.
+    """
 
     name: str
     protocol: str
@@ -67,7 +77,10 @@ class ListenerStats(msgspec.Struct, frozen=True):
 
 
 class DiskSpace(msgspec.Struct, frozen=True):
-    """The disk that a file is written to. use: ``audit``, ``latches`` or ``recording``."""
+    """The disk that a file is written to.
+
+    use: ``audit``, ``latches`` or ``recording``. path: of the file. free_bytes: left for this user.
+    """
 
     use: str
     path: str
@@ -77,9 +90,10 @@ class DiskSpace(msgspec.Struct, frozen=True):
 class Stats(FleetMessage, frozen=True):
     """What the gateway of a robot does and uses; once a second.
 
-    rates: messages that it published in the last second, by the first part of the key: ``{"pose": 20.0}``. gaps:
-    messages of the robot that were lost before they reached the gateway, where a sequence shows it. refused: commands;
-    dropped: messages. All three are counted since the process started.
+    process: that it runs in. rates: messages that it published in the last second, by the first part of the key:
+    ``{"pose": 20.0}``. gaps: messages of the robot that were lost before they reached the gateway, where a sequence
+    shows it, since the process started. refused: commands, since then. dropped: messages, since then. listeners: of the
+    process. disks: that it writes to.
     """
 
     process: ProcessStats
@@ -92,9 +106,10 @@ class Stats(FleetMessage, frozen=True):
 
 
 class Sessions(FleetMessage, frozen=True):
-    """The sessions of one process, the live ones first.
+    """The sessions of one process.
 
-    process, listeners: of a process that serves HQ programs only, which has no :class:`Stats` of its own.
+    sessions: the live ones first. process, listeners: of a process that serves HQ programs only, which has no
+    :class:`Stats` of its own.
     """
 
     sessions: tuple[SessionEntry, ...]

@@ -182,47 +182,86 @@ def _family(prefix: str, message: type[FleetMessage], delivery: Delivery, most_b
 
 
 SCAN = Topic("scan", Scan, Delivery.STREAM)
+"""A sweep of an ALF vehicle or a ROS 2 robot; a Webots robot's distance sensors by bearing; simulated lidar data."""
 MOTION = Topic("motion", Motion, Delivery.STREAM)
+"""Speed, accelerations, gyro, temperature."""
 POSE = Topic("pose", Pose, Delivery.STREAM)
+"""Where the robot is on its own map."""
 TEXT = Topic("text", Text, Delivery.STREAM)
+"""A text of the robot for people, or its request for simulated lidar data."""
 IMAGE = Topic("image", Image, Delivery.STREAM)
+"""One picture of ``[camera]``, or of a ROS 2 robot; only while somebody subscribes."""
 BATTERY = Topic("battery", Battery, Delivery.STREAM)
+"""Level, voltage, current."""
 SENSOR = _family("sensor", Reading, Delivery.STREAM)
+"""One sensor's value."""
 RAW = _family("raw", Raw, Delivery.STREAM)
+"""Legacy messages that no fleet message represents, by protocol: ``raw/tcpudp``."""
 
 STATUS = Topic("status", Status, Delivery.STATE)
+"""Whether the robot can be used, its version and links, what it accepts now; also once a second."""
 CONTROL = Topic("control", Control, Delivery.STATE)
+"""Who drives, latched stops, recent stops and refusals; also once a second."""
 SCANNER = Topic("scanner", Scanner, Delivery.STATE)
+"""The geometry of the scanner."""
 MAP = Topic("map", Map, Delivery.STATE)
+"""The robot's occupancy map."""
 LIDAR = Topic("lidar", Switch, Delivery.STATE)
+"""Whether the lidar is on."""
 CAMERA = Topic("camera", Switch, Delivery.STATE)
+"""Whether the camera is on."""
 DEVICES = Topic("devices", Devices, Delivery.STATE)
+"""The device table of a Webots robot."""
 STATS = Topic("@gateway/stats", Stats, Delivery.STATE)
+"""What the gateway does and uses, once a second; no wildcard of data such as ``fleet/r1/**`` includes it."""
 
 CMD_DRIVE = Topic("@cmd/drive", Drive, Delivery.COMMAND, SMALL_BYTES)
+"""Motion, or neutral; needs the lease."""
 CMD_STOP = Topic("@cmd/stop", Stop, Delivery.COMMAND, SMALL_BYTES)
+"""Stops the robot now; open to everyone. An empty payload is a plain stop."""
 CMD_MODE = Topic("@cmd/mode", Mode, Delivery.COMMAND, SMALL_BYTES)
+"""Who moves the robot; needs the lease."""
 CMD_LIGHT = Topic("@cmd/light", Switch, Delivery.COMMAND, SMALL_BYTES)
+"""Switches the light; needs no lease."""
 CMD_LIDAR = Topic("@cmd/lidar", Switch, Delivery.COMMAND, SMALL_BYTES)
+"""Switches the lidar; needs no lease."""
 CMD_CAMERA = Topic("@cmd/camera", Switch, Delivery.COMMAND, SMALL_BYTES)
+"""Switches the camera; needs no lease."""
 CMD_TEXT = Topic("@cmd/text", Text, Delivery.COMMAND, LARGE_BYTES)
+"""A text for the robot; needs no lease."""
 CMD_SCAN = Topic("@cmd/scan", Scan, Delivery.COMMAND, LARGE_BYTES)
+"""Simulated lidar data for a TCP/UDP robot; needs no lease."""
 CMD_MOTOR = _family("@cmd/motor", Motor, Delivery.COMMAND, SMALL_BYTES)
+"""One motor of a Webots robot; needs the lease."""
 CMD_SENSOR = _family("@cmd/sensor", SensorSetting, Delivery.COMMAND, SETTING_BYTES)
+"""Settings of one sensor; needs no lease."""
 CMD_RAW = _family("@cmd/raw", Raw, Delivery.COMMAND, LARGE_BYTES)
+"""A legacy message for the robot, by protocol; needs the lease."""
 
 RPC_SESSIONS = _family("@rpc/sessions", Query, Delivery.QUERY, QUERY_BYTES)
+"""The sessions of one process with robots and HQ programs: ``gateway``, ``hq.<name>.<zid>``; ``*``: of all."""
 RPC_MAP = Topic("@rpc/map", Query, Delivery.QUERY, QUERY_BYTES)
+"""Asks the robot for its map now; answered or refused within 2 s."""
 RPC_POSE = Topic("@rpc/pose", Query, Delivery.QUERY, QUERY_BYTES)
+"""Asks the robot for its pose now; answered or refused within 2 s."""
 RPC_ACQUIRE = _family("@rpc/control/acquire", Acquire, Delivery.QUERY, QUERY_BYTES)
+"""Asks for the lease, by the name of the one who asks."""
 RPC_TAKEOVER = _family("@rpc/control/takeover", Acquire, Delivery.QUERY, QUERY_BYTES)
+"""Takes the lease from whoever has it."""
 RPC_RENEW = Topic("@rpc/control/renew", Authorization, Delivery.QUERY, SMALL_BYTES)
+"""Extends the lease."""
 RPC_RELEASE = Topic("@rpc/control/release", Authorization, Delivery.QUERY, SMALL_BYTES)
+"""Gives the lease back."""
 RPC_UNLATCH = _family("@rpc/control/unlatch", Unlatch, Delivery.QUERY, SMALL_BYTES)
+"""Releases a latched stop of this robot."""
 RPC_UNLATCH_FLEET = _family("@rpc/control/unlatch_fleet", Unlatch, Delivery.QUERY, SMALL_BYTES)
+"""Releases a latched stop of the whole fleet."""
 RPC_LATCH = Topic("@rpc/latch", Query, Delivery.QUERY, SMALL_BYTES)
+"""The fleet's latched stops that this gateway knows, and the last 64 ids released."""
 RPC_REFUSED = _family("@rpc/control/refused", Refusals, Delivery.QUERY, SETTING_BYTES)
+"""A listener reports what it refused its HQ programs, at ``hq.<listener>``."""
 RPC_RESTART = _family("@rpc/restart", Query, Delivery.QUERY, QUERY_BYTES)
+"""The gateway hands everything over to a new process; replies once that is done, or refused with the reason."""
 
 _TOPICS = {topic.path: topic for topic in list(globals().values()) if isinstance(topic, Topic)}
 

@@ -17,7 +17,11 @@ Seconds = Annotated[float, msgspec.Meta(gt=0, le=3600)]
 
 
 class ListenerTls(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The files of a listener at ``tls://``. ca: clients must show a certificate of this authority; None: of none."""
+    """The files of a listener at ``tls://``.
+
+    certificate: of the listener. key: of this certificate. ca: clients must show a certificate of this authority; None:
+    of none.
+    """
 
     certificate: str
     key: str
@@ -27,10 +31,11 @@ class ListenerTls(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class HqSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One ``[[hq]]``: where HQ programs of one protocol connect as if this were the robot, and their limits.
 
-    name: of the listener on the bus; None: made of the protocol and the process. clients: most at a time. accept_hz:
-    connections a second that are accepted from one address. handshake_s: longest time for a client's handshake.
-    idle_s: longest silence of a client; None: no limit. rate_hz: messages a second of one client. allow: networks that
-    clients may connect from; empty: all. tls: what is shown to clients, at an address ``tls://host:port``.
+    protocol: of the HQ programs. listen: ``tcp://host:port`` or ``tls://host:port``. name: of the listener on the bus;
+    None: made of the protocol and the process. clients: most at a time. accept_hz: connections a second that are
+    accepted from one address. handshake_s: longest time for a client's handshake. idle_s: longest silence of a client;
+    None: no limit. rate_hz: messages a second of one client. allow: networks that clients may connect from; empty: all.
+    tls: what is shown to clients, at an address ``tls://host:port``.
     """
 
     protocol: str

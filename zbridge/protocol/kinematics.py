@@ -26,9 +26,10 @@ def within_full_scale(forward: float, left: float, turn: float) -> Drive:
 
 
 class Differential(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Two sides of wheels, ``track_m`` apart.
+    """Two sides of wheels.
 
-    ``speed_full_m_s``: speed over ground at ``forward`` = 1. ``turn_full_rad_s``: yaw rate at ``turn`` = 1.
+    track_m: between the sides. speed_full_m_s: over ground at ``forward`` = 1. turn_full_rad_s: yaw rate at
+    ``turn`` = 1.
     """
 
     track_m: Positive
@@ -54,7 +55,10 @@ class Differential(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 
 class Factors(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What ``forward``, ``left`` and ``turn`` = 1 each add to the value of one motor, in the motor's unit."""
+    """What each part of a drive adds to the value of one motor.
+
+    forward, left, turn: at 1, in the motor's unit.
+    """
 
     forward: Factor = 0.0
     left: Factor = 0.0

@@ -53,7 +53,12 @@ class RouterLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class RouterSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A router's TOML file. Paths in it are relative to the file."""
+    """A router's TOML file. Paths in it are relative to the file.
+
+    listen: where members connect; without it ``tcp/127.0.0.1:7447``, with tls ``tls/0.0.0.0:7447``. connect: other
+    routers. realm: the first chunk of all keys. tls: the files of its certificate. roles: the file that says who may do
+    what. insecure: serve other machines without tls.
+    """
 
     listen: tuple[Connection, ...] = ()
     connect: tuple[Connection, ...] = ()

@@ -19,7 +19,10 @@ Metres = Annotated[float, msgspec.Meta(ge=-1e3, le=1e3)]
 
 
 class Mount(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Where a scanner or another sensor is on the robot: metres from the robot's middle on the ground, radians."""
+    """Where a scanner or another sensor is on the robot.
+
+    x, y, z: metres from the robot's middle on the ground. yaw: radians.
+    """
 
     x: Metres = 0.0
     y: Metres = 0.0
@@ -32,9 +35,9 @@ class RobotBody(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     speed_full_mps, turn_full_radps: its speeds at full scale. wheelbase_m: of a robot that steers, between its axles;
     None: it turns on the spot. steer_full_rad: how far its wheels turn at full lock; an ALF vehicle gets 90 degrees
-    then. length_m, width_m, height_m: what RViz shows. sensors: where those of these names are, and the ``camera``; of
-    others no frame is told. map_to_odom: tell ROS that odometry begins at the map's origin; false where a program of
-    ROS's, as slam_toolbox, tells it.
+    then. length_m, width_m, height_m: what RViz shows. laser: where the scanner is. sensors: where those of these
+    names are, and the ``camera``; of others no frame is told. map_to_odom: tell ROS that odometry begins at the map's
+    origin; false where a program of ROS's, as slam_toolbox, tells it.
     """
 
     speed_full_mps: Above = 1.0
@@ -50,9 +53,12 @@ class RobotBody(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Ros2Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The file, TOML; options win over it. robots: those that are shown, empty for all.
+    """The file, TOML; options win over it.
 
-    others: of robots that have no table of their own below ``robot``.
+    domain: ROS_DOMAIN_ID. distro: of ROS. ros: ROS's routers, never the fleet's; empty: the one on this machine.
+    robots: those that are shown, empty for all. drive: let publishers drive. realm: the first chunk of all keys. bus:
+    the fleet's, as in a robot's file. others: of robots that have no table of their own below ``robot``. robot: tables
+    of single robots.
     """
 
     domain: int = 0

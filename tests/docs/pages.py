@@ -79,7 +79,7 @@ def exchanges(console: str) -> Iterator[tuple[str, str]]:
 _MASKS = (
     (r"\b\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d)?(\.\d+)?)?( ?UTC|Z)?", "DATE"),
     (r"\b\d\d:\d\d(:\d\d)?(\.\d+)?\b", "TIME"),
-    (r"\b[0-9a-f]{8,}\b", "ID"),
+    (r"\b[0-9a-f]{8,}\b|\b\d{10,}\b", "ID"),
     (r"\b(process|pid|PID) \d+", r"\1 N"),
     (r"(?<![\w.])-?\d+(\.\d+)? ?(ns|us|ms|s|min|h|days?|kB|MB|GB|M|%|Hz|/s)(?!\w)", "N"),
     (r"(?<![\w.])-?\d+\.\d+(e-?\d+)?(?![\w.])", "N"),

@@ -7,7 +7,7 @@ import pytest
 
 from zbridge.errors import Code, Held, LeaseLost, Refused, Unsupported, refusal
 
-PAGE = (Path(__file__).parents[1] / "docs" / "explanation" / "who-may-drive.md").read_text()
+PAGE = (Path(__file__).parents[1] / "docs" / "reference" / "refusals.md").read_text()
 
 
 @pytest.mark.parametrize("code", Code)

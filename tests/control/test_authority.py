@@ -137,7 +137,7 @@ def must_be_neutral(authority: Authority, why: str) -> None:
 
 
 def test_the_table_of_the_documentation_is_the_one_that_is_executed() -> None:
-    assert documented("explanation/who-may-drive.md", "input") == executed(AuthorityMachine.TABLE)
+    assert documented("reference/state-tables.md", "input") == executed(AuthorityMachine.TABLE)
 
 
 # The lease

@@ -177,7 +177,7 @@ WAITING = [
 
 
 def test_the_table_of_the_documentation_is_the_one_that_is_executed() -> None:
-    assert documented("explanation/who-may-drive.md", "event") == executed(LeaseClient.TABLE)
+    assert documented("reference/state-tables.md", "event") == executed(LeaseClient.TABLE)
 
 
 @pytest.mark.parametrize(

@@ -119,7 +119,7 @@ def test_a_stick_may_need_neutral_from_the_beginning() -> None:
 
 
 def test_the_table_of_the_documentation_is_the_one_that_is_executed() -> None:
-    assert documented("explanation/who-may-drive.md", "the stick, or its lease") == executed(Stick.TABLE)
+    assert documented("reference/state-tables.md", "the stick, or its lease") == executed(Stick.TABLE)
 
 
 BARRED = (StickState.IDLE_NEEDS_NEUTRAL, StickState.ASKING_NEEDS_NEUTRAL, StickState.HOLDING_NEEDS_NEUTRAL)

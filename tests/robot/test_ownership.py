@@ -560,7 +560,7 @@ async def test_the_successor_of_one_that_had_yielded_has_yielded() -> None:
 
 
 def test_the_table_of_the_documentation_is_the_one_that_is_executed() -> None:
-    assert documented("explanation/who-may-drive.md", "found") == executed(Ownership.TABLE)
+    assert documented("reference/state-tables.md", "found") == executed(Ownership.TABLE)
 
 
 @pytest.mark.parametrize("noticed", [False, True])

@@ -1,6 +1,6 @@
 """Rules about latched stops of the whole fleet, which the gateways of other robots know too.
 
-Source: "The latched stop" in ``who-may-drive.md``: who missed one learns of it from them before it grants a lease, and
+Source: "Latched stops" in ``lease.md``: who missed one learns of it from them before it grants a lease, and
 nobody takes over what one of them knows to be released.
 """
 

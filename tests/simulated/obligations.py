@@ -95,7 +95,7 @@ class Obligations:
             self._connected_at = self.world.now
         if what == "connected":
             grant = self.checker.current.get(self.checker.by_host.get(fields[0][0], ""))
-            if grant is not None:  # a robot that was lost is stopped when it comes back: who-may-drive.md
+            if grant is not None:  # a robot that was lost is stopped when it comes back: state-tables.md
                 grant.autonomous = False
         elif what in ("drops", "ignores"):
             self._dropped_at = self.world.now

@@ -1,6 +1,6 @@
 """What must become of leases that nobody uses: of HQ programs that are idle, gone, or whose listener was frozen.
 
-Source: "HQ programs that know of no lease" in ``who-may-drive.md``. Programs are judged by their own notes.
+Source: "The stick" in ``state-tables.md``. Programs are judged by their own notes.
 """
 
 from __future__ import annotations

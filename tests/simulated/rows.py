@@ -1,4 +1,4 @@
-"""Which rows of the tables of ``who-may-drive.md`` and ``failures.md`` a run reached, and how often.
+"""Which rows of the tables of ``state-tables.md``, ``refusals.md`` and ``failures.md`` a run reached, and how often.
 
 The tables of the machines are what the code executes: each is replaced by one that counts its inputs. The other rows
 are counted by what the checker saw.

@@ -1,6 +1,6 @@
 """Which of two gateways has to serve the robot, where only one of them reaches it.
 
-Source: "One gateway per robot" in ``who-may-drive.md`` and the table of two gateways in ``failures.md``: the
+Source: "The owner of a robot" in ``state-tables.md`` and the table of two gateways in ``failures.md``: the
 gateway that yielded serves the robot again once the owner's robot falls silent.
 """
 

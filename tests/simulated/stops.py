@@ -1,6 +1,6 @@
 """Rules about stops: those that are reported, those that are repeated, and those that have to wait.
 
-Source: "The latched stop" in ``who-may-drive.md``, "When the robot's program or its link stalls" and the silence after
+Source: "Latched stops" in ``lease.md``, "When the robot's program or its link stalls" and the silence after
 packet 4 in ``failures.md``.
 """
 

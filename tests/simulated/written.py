@@ -133,7 +133,7 @@ class Written:
                 self._open[gateway] = (end, self._world.now)
 
     def _require_neutral(self, gateway: str) -> None:
-        """Whoever held a robot that was lost must say neutral: who-may-drive.md, "require neutral"."""
+        """Whoever held a robot that was lost must say neutral: state-tables.md, "require neutral"."""
         _, open_at = self._open.pop(gateway, (None, 0.0))
         grant = self._checker.current.get(gateway)
         if grant is not None and grant.ended_at is None and grant.at < open_at:

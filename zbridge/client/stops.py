@@ -3,7 +3,7 @@
 Each stop has its own id, and is repeated until ``control`` shows that id: whatever the network loses or delays, the
 robot's gateway has carried out a confirmed stop. A robot's latched stop is released by its id; a stop of the whole
 fleet has one id for all robots.
-Source: the design's "Latched stop".
+Source: "Latched stops" in ``lease.md``.
 """
 
 from __future__ import annotations

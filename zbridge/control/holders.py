@@ -7,7 +7,7 @@ of two machines are never compared. The gateway compares what it receives with t
 clocks drift apart, and a network may become slower for good: so the baseline may rise, by :data:`RISES_MS_PER_S`.
 
 A baseline that was first taken from a late question is too high; the next command in time lowers it.
-Source: the design's "Who may drive" and "Command age".
+Source: "Sequence numbers" and "Timestamps" in ``lease.md``.
 """
 
 from __future__ import annotations

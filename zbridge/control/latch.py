@@ -11,7 +11,7 @@ comes next must stop such a robot in a way that ends that too. Nothing resets it
 
 Bounds: :data:`LATCHES` ids are in force; one more replaces the last, and the robot stays latched. The last
 :data:`RELEASED` released ids of each kind are remembered.
-Source: the design's "Latched stop".
+Source: "Latched stops" in ``lease.md``.
 """
 
 from __future__ import annotations

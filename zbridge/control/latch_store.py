@@ -5,7 +5,7 @@ It also stores whether the robot was ever ordered to move by itself (:attr:`Latc
 A gateway that owns its robot writes ``<realm>@<robot>.latches``. One that waits for another gateway writes what that
 one says to ``<realm>@<robot>.standby.latches``: both may run on one machine, and neither may overwrite what the other
 knows. A file that cannot be read means latched: nobody knows what stood in it.
-Source: the design's "Latched stop".
+Source: "Latched stops" in ``lease.md``.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Keeps a robot stopped while nobody drives: repeats its stop quickly for a second, then every ``idle_stop_s``.
 
-A stalled robot program or link may have lost all of the first stops (design, "Who may drive").
+A stalled robot program or link may have lost all of the first stops ("Stops" in ``lease.md``).
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ Neutral of a part, while the program still moves another: it is passed on, and e
 What may have waited in the network. After a silence of the program longer than its deadman, an old neutral may come,
 and an old push behind it. So a neutral then counts only once :data:`RESTS_S` pass without motion. Until then it is
 passed on, as neutral of a part is, and neutral is still needed.
-Source: the design's "Old HQ programs".
+Source: "The stick of an HQ program" in ``state-tables.md``.
 """
 
 from __future__ import annotations

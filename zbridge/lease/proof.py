@@ -9,7 +9,7 @@ number once. Commands and questions are numbered separately; the proof of a ques
 :class:`Signer` is the holder's end. :class:`Verifier` is the gateway's: it checks proofs;
 :class:`zbridge.control.holders.Holders` also checks numbers. The bus's thread verifies a command and leaves a note in
 the verifier; the event loop's thread takes the note, so that each proof is computed once.
-Source: the design's "Who may drive" and "Command age".
+Source: "Proofs" and "Timestamps" in ``lease.md``.
 """
 
 from __future__ import annotations

@@ -29,8 +29,8 @@ COMMAND = re.compile(r"(?:^|&& )zbridge ([a-z0-9]+)(.*)", re.MULTILINE)
 SPAN = re.compile(r"`([^`\n]+)`")
 BLOCK = re.compile(r"^```\w*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
-GROUPS = ("zbridge.protocols", "zbridge.service")
-"""Dotted names that are no modules: the entry-point group, the unit of systemd."""
+GROUPS = ("zbridge.protocols", "zbridge.service", "zbridge.link")
+"""Dotted names that are no modules: the entry-point group, the unit of systemd, a logger."""
 THEIRS = (
     *("users.toml", "hq.toml", "r1.toml", "r2.toml", "e1.toml", "host.toml", "router.toml", "roles.toml", "bus.toml"),
     *("pyproject.toml", "README.md", "CHANGELOG.md"),

@@ -2,7 +2,7 @@
 
 ``sequence`` implements both ends, the predecessor and the successor; ``channel`` is the Unix socket between them and
 its messages, ``restarts`` what a gateway hands over and who may request it, ``processes`` how a successor is started
-and ended. ``architecture.md``, "A restart", has the sequence.
+and ended. ``restarts.md`` has the sequence.
 """
 
 from zbridge.app.handover.processes import Spawn, Successor

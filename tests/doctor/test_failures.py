@@ -1,4 +1,4 @@
-"""Each documented failure, broken on a bus of its own, and doctor's verdict: the table of ``troubleshoot.md``."""
+"""Each documented failure, broken on a bus of its own, and doctor's verdict: the table of ``doctor.md``."""
 
 from __future__ import annotations
 
@@ -31,9 +31,7 @@ from zbridge.fleet.processes import DiskSpace, SessionEntry, Stats
 
 pytestmark = pytest.mark.jumping
 PAGE = (
-    (Path(__file__).parents[2] / "docs" / "how-to" / "troubleshoot.md")
-    .read_text()
-    .partition("## Documented failures")[2]
+    (Path(__file__).parents[2] / "docs" / "reference" / "doctor.md").read_text().partition("## Documented failures")[2]
 )
 ROWS = re.findall(r"^\| ([^|]+) \| [^|]+ \| (?:anywhere|host|silence) \|$", PAGE, re.MULTILINE)
 

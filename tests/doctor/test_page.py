@@ -13,7 +13,7 @@ from zbridge.errors import Code
 from zbridge.protocol.plugin import find_protocol, protocol_names
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs" / "how-to" / "troubleshoot.md").read_text()
+PAGE = (ROOT / "docs" / "reference" / "doctor.md").read_text()
 MAKERS = {"error", "note", "warning", "ok", "Finding"}
 STATES = ("offline", "connecting", "handshaking", "closing")
 

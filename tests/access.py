@@ -1,6 +1,6 @@
 """Who may do what as a table: what the code grants, what a router was seen to let through, and the page, in one form.
 
-``python -m tests.access`` prints the table of ``secure-bus.md`` as the code grants it.
+``python -m tests.access`` prints the table of ``roles.md`` as the code grants it.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ def cell(allowed: Callable[[str | None], set[MessageKind]], robots: tuple[str | 
 
 
 def table(allowed: set[Try]) -> str:
-    """Write the table of ``secure-bus.md``; paths that no column tells apart share a row."""
+    """Write the table of ``roles.md``; paths that no column tells apart share a row."""
     rows: dict[tuple[str, ...], list[str]] = {}
     for paths, robots in ((PATHS, (OWN, OTHER)), (OTHERS, (None,))):
         for path in paths:

@@ -22,7 +22,7 @@ from tests.e2e.rigs.secure import FAR, GRACE_S, ROLES, Matrix, SecureBus, declar
 from zbridge.security.access import STOPS_HZ, Column
 from zbridge.security.roles import Roles
 
-PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "secure-bus.md"
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "roles.md"
 
 
 class Scene:

@@ -24,7 +24,7 @@ from zbridge.security.access import (
 )
 from zbridge.security.roles import OF_ROBOTS, ROLES, Member, Roles
 
-PAGE = (Path(__file__).parents[2] / "docs" / "how-to" / "secure-bus.md").read_text()
+PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "roles.md").read_text()
 RULES = access_control(LAB, REALM)
 INGRESS = [rule for rule in RULES["rules"] if rule["flows"] == ["ingress"]]
 EGRESS = [rule for rule in RULES["rules"] if rule["flows"] == ["egress"]]

@@ -1,6 +1,6 @@
 """Who may do what on a secure bus: one table, and the router's access rules made of it, in Zenoh's own form.
 
-The table is :data:`GRANTS`: for each role, which messages it may send on which keys; ``secure-bus.md`` shows it.
+The table is :data:`GRANTS`: for each role, which messages it may send on which keys; ``roles.md`` shows it.
 What it lacks is denied. Nothing is denied by name, because a denial of ``@cmd/drive`` would not match a put on
 ``@cmd/*``.
 

@@ -64,8 +64,8 @@ class Page:
         for block in blocks(self._path.read_text()):
             if block.says("elsewhere") is not None:
                 continue
-            if (hidden := block.says("setup")) is not None:
-                self._background(block, hidden, None)
+            for number, hidden in enumerate(argument for word, argument in block.how if word == "setup"):
+                self._background(f"{block.line}.{number}", hidden, None)
             with self._at(block):
                 self._block(block)
 
@@ -97,7 +97,7 @@ class Page:
             *before, last = _commands(block.text)
             if before:
                 self._must("\n".join(before))
-            self._background(block, last, until.removeprefix("until ") or None)
+            self._background(str(block.line), last, until.removeprefix("until ") or None)
         else:
             self._must(block.text)
 
@@ -149,8 +149,8 @@ class Page:
                 raise PageError(f"\n$ {command}\n{wrong}")
             time.sleep(0.5)
 
-    def _background(self, block: Block, command: str, until: str | None) -> None:
-        log = self._state / f"background-{block.line}"
+    def _background(self, name: str, command: str, until: str | None) -> None:
+        log = self._state / f"background-{name}"
         with log.open("w") as output:
             process = subprocess.Popen(
                 self._shell(f"trap - EXIT\n{command}"),

@@ -1,8 +1,8 @@
 """The blocks of a page: what it tells to type, the files it shows, and what a run of it must know.
 
 A comment on the line above a block says how it is run: ``<!-- run: background -->`` until the page ends,
-``background until TEXT`` where TEXT in its output says that it is ready, ``setup COMMAND`` a hidden command in the
-background before it, ``keys w w space q`` on a terminal, ``elsewhere PATH: reason`` by another file of the project.
+``background until TEXT`` where TEXT in its output says that it is ready, ``setup COMMAND``, or ``setup
+COMMAND until TEXT``, a hidden command in the background before it, ``keys w w space q`` on a terminal, ``elsewhere PATH: reason`` by another file of the project.
 """
 
 from __future__ import annotations

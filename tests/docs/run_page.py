@@ -65,7 +65,8 @@ class Page:
             if block.says("elsewhere") is not None:
                 continue
             for number, hidden in enumerate(argument for word, argument in block.how if word == "setup"):
-                self._background(f"{block.line}.{number}", hidden, None)
+                command, _, until = hidden.partition(" until ")
+                self._background(f"{block.line}.{number}", command, until or None)
             with self._at(block):
                 self._block(block)
 

@@ -11,7 +11,7 @@ from zbridge.fleet import topics
 DOCS = Path(__file__).parents[2] / "docs"
 EXAMPLE = DOCS / "examples" / "khepera"
 GUIDE = (DOCS / "how-to" / "add-a-protocol.md").read_text()
-LISTINGS = re.findall(r"^```(?:python|toml) (\S+)\n(.*?)^```$", GUIDE, re.DOTALL | re.MULTILINE)
+LISTINGS = re.findall(r'^```(?:python|toml)(?: title="(\S+)")?\n(.*?)^```$', GUIDE, re.DOTALL | re.MULTILINE)
 FILES = ("pyproject.toml", *(str(path.relative_to(EXAMPLE)) for path in sorted((EXAMPLE / "khepera").glob("*.py"))))
 MOST_LINES = 250
 
@@ -27,11 +27,11 @@ def test_the_listings_of_a_file_put_together_are_the_file(file: str) -> None:
 
 
 def test_every_listing_is_of_a_file_or_is_run() -> None:
-    assert {name for name, _ in LISTINGS} == {*FILES, "run"}
-    assert len(re.findall(r"^```\S", GUIDE, re.MULTILINE)) == len(LISTINGS)
+    assert {name for name, _ in LISTINGS} == {*FILES, ""}
+    assert len(re.findall(r"^```(?:python|toml)", GUIDE, re.MULTILINE)) == len(LISTINGS)
 
 
-@pytest.mark.parametrize("program", [listing for name, listing in LISTINGS if name == "run"])
+@pytest.mark.parametrize("program", [listing for name, listing in LISTINGS if not name])
 def test_a_listing_of_no_file_runs(program: str) -> None:
     exec(compile(program, "the guide", "exec", dont_inherit=True), {"__name__": "guide"})
 

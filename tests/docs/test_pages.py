@@ -61,6 +61,13 @@ def test_every_block_says_what_it_is(page: Path) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
+def test_no_command_hides_in_an_indented_block(page: Path) -> None:
+    indented = r"^(?:    |\t)(?:zbridge|pip|python|sudo|bash) .*$"
+    inside = "".join(block.text for block in blocks(page.read_text()))
+    assert [line for line in re.findall(indented, page.read_text(), re.MULTILINE) if line.strip() not in inside] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
 def test_what_is_run_elsewhere_is_named_there(page: Path) -> None:
     for block in blocks(page.read_text()):
         told = block.says("elsewhere")

@@ -122,7 +122,7 @@ class Released:
         return close and gone_s < ORDER_S and cut_s < most_s
 
     def waited(self, motion: float, gives: Mapping[str, Iterable[tuple[float, float]]]) -> bool:
-        """Whether a program gave this motion while a cut held it up that found its stick centred: hq-programs.md."""
+        """Whether a program gave this motion while a cut held it up that found its stick centred: translation.md."""
         for program, (cut_at, healed_at) in self._waited.items():
             if self._world.now - healed_at < AT_ONCE_S and any(
                 cut_at < at < healed_at + ORDER_S and abs(value - motion) < CLOSE for at, value in gives[program]

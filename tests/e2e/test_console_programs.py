@@ -1,4 +1,4 @@
-"""What ``console.md`` shows to programs, run as it stands there against a console with users."""
+"""What ``console-api.md`` shows to programs, run as it stands there against a console with users."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from pathlib import Path
 
 from tests.e2e.conftest import HOST, Bench, start, until
 
-PAGE = (Path(__file__).parents[2] / "docs" / "how-to" / "console.md").read_text()
+PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "console-api.md").read_text()
 SECTION = PAGE.partition("## For programs")[2].partition("\n## ")[0]
 
 
-def example(language: str) -> str:
-    """Give the example of this language."""
-    found = re.search(rf"```{language}\n(.*?)```", SECTION, re.DOTALL)
+def example(language: str, word: str) -> str:
+    """Give the example of this language that begins with this word."""
+    found = re.search(rf"```{language}[^\n]*\n({word} .*?)```", SECTION, re.DOTALL)
     assert found is not None
     return found[1]
 
@@ -32,6 +32,7 @@ def user(bench: Bench, *words: str) -> str:
 def test_curl_and_python_see_the_fleet_and_stop_it(bench: Bench) -> None:
     user(bench, "add", "lab", "--role", "viewer", "--no-password")
     token = user(bench, "token", "lab")
+    (bench.folder / "token.txt").write_text(f"{token}\n")
     bench.serve(bench.simulator())
     files = {"--users": "users.toml", "--journal": "journal", "--roster": "roster"}
     options = [word for option, name in files.items() for word in (option, str(bench.folder / name))]
@@ -46,15 +47,15 @@ def test_curl_and_python_see_the_fleet_and_stop_it(bench: Bench) -> None:
         return bool(json.loads(done.stdout)["robots"])
 
     until(sees, what="the robot")
-    script = example("sh").replace("http://127.0.0.1:8080", at).replace("curl ", "curl -sf ")
+    script = example("sh", "curl").replace("http://127.0.0.1:8080", at).replace("curl ", "curl -sf ")
     script = script.replace("\ncurl", "\necho\ncurl")
-    done = subprocess.run(["bash", "-ec", script], env=environment, capture_output=True, text=True, check=True)
+    done = subprocess.run(["bash", "-ec", script], cwd=bench.folder, capture_output=True, text=True, check=True)
     robots, status, stop, stop_all = map(json.loads, done.stdout.split("\n"))
     assert [row["name"] for row in robots["robots"]] == ["r1"]
     assert status["state"] == "established"
     assert stop == {"text": "r1 stopped (its gateway sent it)", "good": True}
     assert stop_all == {"text": "1 of 1 stopped (their gateways sent it)", "good": True}
-    command = [sys.executable, "-c", example("python")]
+    command = [sys.executable, "-c", example("python", "import")]
     following = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
     try:
         assert following.stdout is not None

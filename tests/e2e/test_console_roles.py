@@ -21,7 +21,7 @@ from zbridge.client import Fleet
 from zbridge.views.console.rights import USER_ROLES, Action, rights_of
 from zbridge.views.console.users import User, hash_password, new_token, save_users
 
-PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "console.md"
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "console-api.md"
 GHOST = "ghost"
 HASHED = hash_password(PASSWORD)
 

@@ -6,7 +6,7 @@
 
 Judged at the socket of a scripted robot behind a real gateway, with a real console and Debian's Chromium in which a
 key is held down. After each way of leaving, what was stalled or frozen comes back, the key is still held, and the robot
-must not move within ``WATCH_S``. Times are those of this machine's monotonic clock. ``console.md`` has the table.
+must not move within ``WATCH_S``. Times are those of this machine's monotonic clock. ``performance.md`` has the table.
 """
 
 from __future__ import annotations

@@ -2,7 +2,8 @@
 
 A comment on the line above a block says how it is run: ``<!-- run: background -->`` until the page ends,
 ``background until TEXT`` where TEXT in its output says that it is ready, ``setup COMMAND``, or ``setup
-COMMAND until TEXT``, a hidden command in the background before it, ``keys w w space q`` on a terminal, ``elsewhere PATH: reason`` by another file of the project.
+COMMAND until TEXT``, a hidden command in the background before it, ``keys w w space q`` on a terminal, ``elsewhere PATH: reason`` by another file of the project,
+``nowhere REASON`` because it needs programs that no test has.
 """
 
 from __future__ import annotations
@@ -44,6 +45,11 @@ class Block:
     def says(self, word: str) -> str | None:
         """Return the argument of a word above the block; None if the word is not there."""
         return dict(self.how).get(word)
+
+    @property
+    def not_here(self) -> bool:
+        """Whether a run of the page leaves it out."""
+        return self.says("elsewhere") is not None or self.says("nowhere") is not None
 
 
 def blocks(page: str) -> Iterator[Block]:

@@ -62,7 +62,7 @@ class Page:
     def run(self) -> None:
         """Run every block; raise PageError at the first that fails."""
         for block in blocks(self._path.read_text()):
-            if block.says("elsewhere") is not None:
+            if block.not_here:
                 continue
             for number, hidden in enumerate(argument for word, argument in block.how if word == "setup"):
                 command, _, until = hidden.partition(" until ")

@@ -17,11 +17,12 @@ GUIDE = ROOT / "docs" / "how-to" / "add-a-protocol.md"  # tests/docs/test_add_a_
 RUN = [
     page
     for page in PAGES
-    if page != GUIDE
-    and any(block.language not in SHOWN and block.says("elsewhere") is None for block in blocks(page.read_text()))
+    if page != GUIDE and any(block.language not in SHOWN and not block.not_here for block in blocks(page.read_text()))
 ]
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 NOT_PROGRAMS = ("sudo", "export", "cd")
+NOT_ON_TEST_MACHINES = {"apt", "ros2", "ros2bag", "rviz2"}
+"""Programs of ROS and of its installation; every other command is run somewhere."""
 PAGE_S = 240
 
 
@@ -55,8 +56,8 @@ def test_every_block_says_what_it_is(page: Path) -> None:
     for block in found:
         assert block.language in (*TYPED, *LISTED, *SHOWN), f"line {block.line}"
         if block.language not in (*SHOWN, *TYPED, "python", "toml"):
-            assert block.title is not None or block.says("elsewhere") is not None, f"line {block.line}: nobody reads it"
-        unknown = {word for word, _ in block.how} - {"background", "setup", "keys", "elsewhere"}
+            assert block.title is not None or block.not_here, f"line {block.line}: nobody reads it"
+        unknown = {word for word, _ in block.how} - {"background", "setup", "keys", "elsewhere", "nowhere"}
         assert not unknown, f"line {block.line}: {unknown}"
 
 
@@ -79,6 +80,13 @@ def test_what_is_run_elsewhere_is_named_there(page: Path) -> None:
         text = "\n".join(file.read_text() for file in files(ROOT / path))
         for program in programs(block):
             assert re.search(rf"\b{re.escape(program)}\b", text), f"line {block.line}: {path} runs no {program}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_what_is_run_nowhere_is_of_programs_that_no_test_machine_has(page: Path) -> None:
+    for block in blocks(page.read_text()):
+        if block.says("nowhere") is not None:
+            assert programs(block) <= NOT_ON_TEST_MACHINES, f"line {block.line}"
 
 
 def files(path: Path) -> list[Path]:

@@ -27,7 +27,8 @@ BARE_FILE = re.compile(r"(?<![\w/.*-])\w+\.(?:py|toml|md|hex)\b(?!\()")
 MODULE = re.compile(r"(?<![\w./:@\"-])(?:zbridge|gateways|tests)(?:\.[A-Za-z_]\w*)+")
 COMMAND = re.compile(r"(?:^|&& )zbridge ([a-z0-9]+)(.*)", re.MULTILINE)
 SPAN = re.compile(r"`([^`\n]+)`")
-BLOCK = re.compile(r"^```\w*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+BLOCK = re.compile(r"^```\w*[^\n`]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+TITLE = re.compile(r'^```\w* title="([^"]+)"', re.MULTILINE)
 
 GROUPS = ("zbridge.protocols", "zbridge.service", "zbridge.link")
 """Dotted names that are no modules: the entry-point group, the unit of systemd, a logger."""
@@ -69,7 +70,7 @@ def test_every_file_that_is_named_exists(page: Path) -> None:
         found = (
             path for top in ("zbridge", "gateways", "tests", "docs", "deploy") for path in (ROOT / top).rglob(name)
         )
-        assert name in THEIRS or next(found, None), name
+        assert name in (*THEIRS, *TITLE.findall(text)) or next(found, None), name
 
 
 def test_the_page_of_the_architecture_names_every_room() -> None:

@@ -10,7 +10,7 @@ from docs.diagrams.machines import kind_of
 from docs.diagrams.svg import Kind, Picture
 from zbridge.control.authority import Authority
 from zbridge.control.settings import ControlSettings
-from zbridge.fleet.messages import Acquire
+from zbridge.fleet.lease_messages import Acquire
 from zbridge.lease.proof import Signer, read
 
 SETTINGS = ControlSettings()

@@ -11,7 +11,7 @@ from types import ModuleType
 import msgspec
 
 from docs.generate.declared import fields, plain, summary, table
-from zbridge.fleet import messages, processes, topics
+from zbridge.fleet import lease_messages, messages, processes, topics
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import QOS, Delivery, Topic
 
@@ -99,5 +99,6 @@ def sections() -> dict[str, str]:
         **{f"keys {delivery.value}": keys(delivery) for delivery in Delivery},
         "delivery": qualities(),
         "messages": structs(messages),
+        "lease messages": structs(lease_messages),
         "processes": structs(processes),
     }

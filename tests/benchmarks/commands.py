@@ -44,7 +44,7 @@ from tests.benchmarks.gateway import head
 from tests.benchmarks.harness import Spread, thread_cpu_s
 from tests.benchmarks.scene import WARM, Drive, Flood, Scene, Through, bare_queries, p99, scene
 from tests.benchmarks.stages import STAGES
-from zbridge.fleet.messages import Lease
+from zbridge.fleet.lease_messages import Lease
 from zbridge.lease.proof import Signer, Verifier, read
 
 RATES_HZ = (50, 500)

@@ -38,7 +38,8 @@ from zbridge.errors import (
 )
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Control, Drive, Lease, Mode, Motor, Raw
+from zbridge.fleet.lease_messages import Lease
+from zbridge.fleet.messages import Control, Drive, Mode, Motor, Raw
 from zbridge.fleet.processes import Membership
 from zbridge.fleet.topics import Congestion, Topic
 from zbridge.lease.lease_client import RETRY_S

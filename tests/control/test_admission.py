@@ -16,7 +16,7 @@ from zbridge.control import admission
 from zbridge.control.admission import OPEN_HZ, SHOWN_HZ, CommandFilter, NameFilter, QueryFilter, RefusalLimit
 from zbridge.control.authority import Authority
 from zbridge.errors import Code, Refused
-from zbridge.fleet.messages import Acquire
+from zbridge.fleet.lease_messages import Acquire
 from zbridge.fleet.topics import KeySpace
 
 DRIVE, MODE, STOP = (f"fleet/r1/@cmd/{name}" for name in ("drive", "mode", "stop"))

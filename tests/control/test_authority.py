@@ -15,7 +15,8 @@ from zbridge.control.authority import Authority
 from zbridge.control.authority_machine import AuthorityMachine
 from zbridge.control.holders import ENDED
 from zbridge.errors import Code, Held, LeaseLost, NeutralFirst, Refused
-from zbridge.fleet.messages import Acquire, Authorization, Control, Lease, Refusal
+from zbridge.fleet.lease_messages import Acquire, Authorization, Lease
+from zbridge.fleet.messages import Control, Refusal
 
 NOW = 100.0
 LEASE_S, DEADMAN_S = 3.0, 2.0
@@ -298,6 +299,16 @@ def test_where_nobody_holds_the_robot_nothing_is_lost_and_a_stop_stops_all_the_s
     assert seen(authority) == (STATES[state][0], False, False, None, None)
     stop(authority)
     assert told(authority) == [f"stopped (stop){STOPS}"]
+    assert authority.state == "stopped"
+
+
+@pytest.mark.parametrize("alive", ["ann.1", None])
+def test_a_peer_whose_last_neighbour_leaves_keeps_the_lease_of_a_holder_with_a_token(alive: str | None) -> None:
+    authority = Authority(LEASE_S, DEADMAN_S, numbered(), alone_is_normal=True)
+    authority.acquire(Acquire(who="ann", alive=alive), NOW)
+    authority.bus_lost()
+    assert authority.state == ("held" if alive else "stopped")
+    authority.vanished("ann.1")
     assert authority.state == "stopped"
 
 

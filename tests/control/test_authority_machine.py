@@ -19,7 +19,7 @@ from tests.proofs import proof, shown
 from zbridge.control.authority import Authority
 from zbridge.control.events import EventKind
 from zbridge.errors import Refused
-from zbridge.fleet.messages import Acquire, Authorization, Lease
+from zbridge.fleet.lease_messages import Acquire, Authorization, Lease
 
 LEASE_S, DEADMAN_S = 3.0, 2.0
 REMEMBERED = 8

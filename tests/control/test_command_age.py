@@ -17,7 +17,7 @@ from tests.proofs import numbered, proof, shown
 from zbridge.control.authority import Authority
 from zbridge.control.holders import CommandAge
 from zbridge.errors import Code, Malformed, NeutralFirst, Refused
-from zbridge.fleet.messages import Acquire, Authorization, Lease
+from zbridge.fleet.lease_messages import Acquire, Authorization, Lease
 
 KEYS = "fleet/r1/"
 DRIVE, RENEW, RELEASE = KEYS + "@cmd/drive", KEYS + "@rpc/control/renew", KEYS + "@rpc/control/release"

@@ -19,7 +19,8 @@ from zbridge.control.events import CommandSender
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import Standstill
 from zbridge.errors import NeutralFirst, RateLimited
-from zbridge.fleet.messages import Acquire, Drive, FleetMessage, Mode, Motor, Raw, Text
+from zbridge.fleet.lease_messages import Acquire
+from zbridge.fleet.messages import Drive, FleetMessage, Mode, Motor, Raw, Text
 from zbridge.fleet.topics import KeySpace
 from zbridge.metrics import Metrics
 

@@ -15,7 +15,8 @@ from zbridge.control.authority import Authority
 from zbridge.control.events import EventKind
 from zbridge.control.latch import LATCHES, RELEASED, STOPS, Latches, LatchRecord, read_stop
 from zbridge.errors import Code, Malformed, ProtocolError, Unsupported
-from zbridge.fleet.messages import Acquire, FleetLatches, Latch, Stop
+from zbridge.fleet.lease_messages import Acquire, FleetLatches
+from zbridge.fleet.messages import Latch, Stop
 
 UNSET = msgspec.UNSET
 

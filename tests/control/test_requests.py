@@ -6,7 +6,7 @@ import pytest
 
 from zbridge.control.requests import LEAST_S, REFUSALS, RefusalCounts, capped, name_of
 from zbridge.errors import Code, Malformed, NotReady
-from zbridge.fleet.messages import Acquire
+from zbridge.fleet.lease_messages import Acquire
 from zbridge.lease.lease_events import NAMED
 
 

@@ -1,9 +1,11 @@
 """The blocks of a page: what it tells to type, the files it shows, and what a run of it must know.
 
-A comment on the line above a block says how it is run: ``<!-- run: background -->`` until the page ends,
-``background until TEXT`` where TEXT in its output says that it is ready, ``setup COMMAND``, or ``setup
-COMMAND until TEXT``, a hidden command in the background before it, ``keys w w space q`` on a terminal, ``elsewhere PATH: reason`` by another file of the project,
-``nowhere REASON`` because it needs programs that no test has.
+A comment on the line above a block says how it is run:
+
+``<!-- run: background -->``, ``background until TEXT``: its last command runs until the page ends; it is ready when
+TEXT is in its output. ``setup COMMAND``, ``setup COMMAND until TEXT``: a hidden command in the background before it.
+``keys w w space x``: on a terminal, with these keys. ``elsewhere PATH: reason``: by another file of the project.
+``nowhere REASON``: it needs programs that no test machine has.
 """
 
 from __future__ import annotations

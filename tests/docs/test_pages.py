@@ -97,7 +97,9 @@ def programs(block: Block) -> set[str]:
     if block.language not in TYPED:
         return set()
     commands = (
-        [command for command, _ in exchanges(block.text)] if block.language == "console" else block.text.splitlines()
+        [command for command, _ in exchanges(block.text)]
+        if block.language == "console"
+        else block.text.replace("\\\n", " ").splitlines()
     )
     words = [command.split() for line in commands for command in line.split(" && ")]
     return {word[1] if word[0] == "sudo" else word[0] for word in words if word and not word[0].startswith("#")} - {

@@ -12,11 +12,16 @@ from hypothesis import strategies as st
 from msgspec import UNSET
 
 from zbridge.errors import PayloadError
+from zbridge.fleet import lease_messages as lm
 from zbridge.fleet import messages as m
 from zbridge.fleet import processes as p
 from zbridge.fleet.payload import decode, encode, pack, schema, unpack
 
-KINDS = {kind for kind in (vars(m) | vars(p)).values() if isinstance(kind, type) and issubclass(kind, m.FleetMessage)}
+KINDS = {
+    kind
+    for kind in (vars(m) | vars(lm) | vars(p)).values()
+    if isinstance(kind, type) and issubclass(kind, m.FleetMessage)
+}
 KINDS.remove(m.FleetMessage)
 
 
@@ -72,9 +77,9 @@ PAYLOADS: list[tuple[m.FleetMessage, dict[str, Any]]] = [
         {"state": "stopped", "refusals": [OFFLINE_SENT], "latches": [], "stops": []}
         | none("holder lease priority expires_in_s"),
     ),
-    (m.Unlatch(STOP), {"id": STOP}),
+    (lm.Unlatch(STOP), {"id": STOP}),
     (
-        m.FleetLatches((m.Latch(STOP, "ann", fleet=True),), (OTHER_STOP,)),
+        lm.FleetLatches((m.Latch(STOP, "ann", fleet=True),), (OTHER_STOP,)),
         {"latches": [LATCH], "released": [OTHER_STOP]},
     ),
     (m.Drive(**DRIVE), {**DRIVE, "turn": 0.0, "light": None}),
@@ -86,16 +91,16 @@ PAYLOADS: list[tuple[m.FleetMessage, dict[str, Any]]] = [
         m.SensorSetting(index=1, value=2.0, values=(1.0, 2.0)),
         {"enable": None, "index": 1, "value": 2.0, "values": [1.0, 2.0]},
     ),
-    (m.Acquire(**ACQUIRE), ACQUIRE),
-    (m.Authorization(lease=LEASE, seq=7, proof=PROOF), {"seq": 7, "lease": LEASE, "proof": PROOF}),
-    (m.Lease(**GRANTED), GRANTED | none("reason code")),
-    (m.Lease(**HELD), HELD | none("lease token")),
+    (lm.Acquire(**ACQUIRE), ACQUIRE),
+    (lm.Authorization(lease=LEASE, seq=7, proof=PROOF), {"seq": 7, "lease": LEASE, "proof": PROOF}),
+    (lm.Lease(**GRANTED), GRANTED | none("reason code")),
+    (lm.Lease(**HELD), HELD | none("lease token")),
     (m.Refusals((OFFLINE,)), {"refusals": [OFFLINE_SENT]}),
     (
         p.Membership(name="g1", role="gateway", robots=("r1",)),
         {"name": "g1", "role": "gateway", "robots": ["r1"]},
     ),
-    (m.Denied("closing", "gateway stopped"), {"code": "closing", "reason": "gateway stopped"}),
+    (lm.Denied("closing", "gateway stopped"), {"code": "closing", "reason": "gateway stopped"}),
     (
         p.Sessions((p.SessionEntry(**SESSION, features=("udp",)),)),
         {"sessions": [{**SESSION, "reason": None, "features": ["udp"], "transport": "tcp"}], "listeners": []},
@@ -126,7 +131,7 @@ def test_every_message_but_the_two_with_arrays_is_shown_above_and_a_schema_names
         (m.Drive, msgpack.packb({"left": -1.0, "forward": 1.0}, use_single_float=True), m.Drive(1.0, -1.0)),
         (m.Drive, b"", m.Drive()),
         (m.Stop, b"", m.Stop()),
-        (m.Acquire, msgpack.packb({"who": "hq"}), m.Acquire("hq", 0, None, None, None)),
+        (lm.Acquire, msgpack.packb({"who": "hq"}), lm.Acquire("hq", 0, None, None, None)),
         (m.Switch, bytes.fromhex("82 a3 726564 00 a2 6f6e c3"), m.Switch(on=True)),  # {"red": 0, "on": true}
     ],
 )
@@ -192,12 +197,12 @@ def test_cells_travel_row_by_row(cells: Any, sent: bytes) -> None:
         (m.Motor, {"value": math.nan}, "value"),
         (m.Mode, {"mode": "sport"}, "mode"),
         (m.Switch, {"on": True, "stamp_ns": "now"}, "stamp_ns"),
-        (m.Authorization, {"seq": 1, "proof": PROOF}, "lease"),
-        (m.Authorization, {"lease": LEASE[1:], "seq": 1, "proof": PROOF}, "lease"),
-        (m.Authorization, {"lease": LEASE, "seq": -1, "proof": PROOF}, "seq"),
-        (m.Authorization, {"lease": LEASE, "proof": PROOF}, "seq"),
+        (lm.Authorization, {"seq": 1, "proof": PROOF}, "lease"),
+        (lm.Authorization, {"lease": LEASE[1:], "seq": 1, "proof": PROOF}, "lease"),
+        (lm.Authorization, {"lease": LEASE, "seq": -1, "proof": PROOF}, "seq"),
+        (lm.Authorization, {"lease": LEASE, "proof": PROOF}, "seq"),
         (m.Refusals, {"refusals": 17 * [{"who": None, "command": "drive", "reason": "", "count": 1}]}, "refusals"),
-        (m.Lease, {"ok": True, "lease": LEASE, "token": TOKEN[:16]}, "token"),
+        (lm.Lease, {"ok": True, "lease": LEASE, "token": TOKEN[:16]}, "token"),
         (m.Scan, {name: value for name, value in SCAN.items() if name != "ranges"}, "`ranges`"),
         (m.Scan, {}, "required field `angle_min`"),
         (m.Scan, {**SCAN, "ranges": bytes(7)}, "ranges: a bin of float32"),

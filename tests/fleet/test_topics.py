@@ -4,6 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from zbridge.fleet import lease_messages as lm
 from zbridge.fleet import messages as m
 from zbridge.fleet import topics
 from zbridge.fleet.topics import Congestion, Delivery, KeySpace, Priority, Topic, escape, find, unescape
@@ -18,8 +19,8 @@ TABLE: dict[Delivery, dict[str, type[m.FleetMessage]]] = {
     | {"@cmd/lidar": m.Switch, "@cmd/camera": m.Switch, "@cmd/text": m.Text, "@cmd/scan": m.Scan}
     | {"@cmd/motor/left": m.Motor, "@cmd/raw/tcpudp": m.Raw, "@cmd/sensor/front": m.SensorSetting},
     Delivery.QUERY: {"@rpc/map": m.Query, "@rpc/pose": m.Query, "@rpc/sessions/r1": m.Query}
-    | {"@rpc/control/renew": m.Authorization, "@rpc/control/release": m.Authorization}
-    | {"@rpc/control/acquire/op1": m.Acquire, "@rpc/control/takeover/user%40host": m.Acquire}
+    | {"@rpc/control/renew": lm.Authorization, "@rpc/control/release": lm.Authorization}
+    | {"@rpc/control/acquire/op1": lm.Acquire, "@rpc/control/takeover/user%40host": lm.Acquire}
     | {"@rpc/control/refused/hq.desk": m.Refusals},
 }
 

@@ -15,7 +15,8 @@ from zbridge.control.admission import is_stop
 from zbridge.control.latch import STOPS, Latches, LatchRecord, read_stop
 from zbridge.errors import LinkError, Malformed, PayloadError, ProtocolError, Unsupported
 from zbridge.fleet import messages, payload, processes, topics
-from zbridge.fleet.messages import Authorization, FleetMessage, Stop
+from zbridge.fleet.lease_messages import Authorization
+from zbridge.fleet.messages import FleetMessage, Stop
 from zbridge.fleet.payload import with_stamp
 from zbridge.host import fd_channel as supervisor
 from zbridge.lease.proof import Verifier, read

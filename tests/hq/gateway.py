@@ -11,7 +11,8 @@ from zbridge.control.authority import Authority
 from zbridge.errors import Refused, Stale
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Acquire, Control, Drive, FleetMessage, Mode, Motor, Raw
+from zbridge.fleet.lease_messages import Acquire
+from zbridge.fleet.messages import Control, Drive, FleetMessage, Mode, Motor, Raw
 from zbridge.fleet.topics import KeySpace
 from zbridge.hq.intent import LEASE_S
 from zbridge.lease.proof import read

@@ -21,7 +21,8 @@ from zbridge.clocks import Clocks
 from zbridge.errors import EncodeError, ProtocolError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Acquire, Drive, FleetMessage, Map, Pose, Query, Scan, Status, Stop, Switch, Text
+from zbridge.fleet.lease_messages import Acquire
+from zbridge.fleet.messages import Drive, FleetMessage, Map, Pose, Query, Scan, Status, Stop, Switch, Text
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
 from zbridge.hq import listener as listeners

@@ -15,19 +15,8 @@ from tests.hq.gateway import KEYS, Gateway
 from tests.hq.scripts import scripts
 from zbridge.errors import BusError, Code, Refused
 from zbridge.fleet import topics
-from zbridge.fleet.messages import (
-    Acquire,
-    Drive,
-    FleetMessage,
-    Mode,
-    Motor,
-    Raw,
-    Refusal,
-    SensorSetting,
-    Status,
-    Stop,
-    Switch,
-)
+from zbridge.fleet.lease_messages import Acquire
+from zbridge.fleet.messages import Drive, FleetMessage, Mode, Motor, Raw, Refusal, SensorSetting, Status, Stop, Switch
 from zbridge.fleet.view import RobotView
 from zbridge.hq.context import Bridge
 from zbridge.hq.intent import Intent

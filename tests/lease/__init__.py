@@ -1,6 +1,6 @@
 from zbridge.control.authority import Authority
 from zbridge.fleet import payload as payloads
-from zbridge.fleet.messages import Acquire, Lease
+from zbridge.fleet.lease_messages import Acquire, Lease
 from zbridge.lease.proof import read
 
 

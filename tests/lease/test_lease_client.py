@@ -17,7 +17,8 @@ from zbridge.bus import Answer
 from zbridge.control.authority import Authority
 from zbridge.errors import BusError, Code, NotReady
 from zbridge.fleet import payload as payloads
-from zbridge.fleet.messages import Acquire, Control, Lease, Refusal
+from zbridge.fleet.lease_messages import Acquire, Lease
+from zbridge.fleet.messages import Control, Refusal
 from zbridge.fleet.topics import KeySpace
 from zbridge.lease.lease_client import ASK_S, LEASE_S, LeaseClient, Question
 from zbridge.lease.lease_events import LeaseEvent, LeaseEventKind, LeaseState

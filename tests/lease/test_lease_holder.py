@@ -14,7 +14,7 @@ from zbridge.bus import IncomingQuery
 from zbridge.control.authority import Authority
 from zbridge.errors import BusError
 from zbridge.fleet import payload as payloads
-from zbridge.fleet.messages import Acquire
+from zbridge.fleet.lease_messages import Acquire
 from zbridge.fleet.topics import KeySpace
 from zbridge.lease.lease_client import LeaseClient
 from zbridge.lease.lease_events import LeaseEvent, LeaseEventKind

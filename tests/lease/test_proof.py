@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tests.bounds import most_kept
 from tests.proofs import packed, proof, shown
 from zbridge.errors import Malformed, PayloadError
-from zbridge.fleet.messages import Authorization, Lease
+from zbridge.fleet.lease_messages import Authorization, Lease
 from zbridge.lease.proof import LEAST_BYTES, MOST_BYTES, NOTES, Signer, Verifier, read
 
 LEASE, TOKEN = bytes(range(8)), bytes(range(100, 132))

@@ -24,7 +24,8 @@ from zbridge.control.latch import Latches, read_stop
 from zbridge.errors import Code, NotReady, Refused, Stale
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Acquire, Control, Drive, Lease, Mode, Motor, Refusal, Stop
+from zbridge.fleet.lease_messages import Acquire, Lease
+from zbridge.fleet.messages import Control, Drive, Mode, Motor, Refusal, Stop
 from zbridge.fleet.topics import KeySpace
 from zbridge.lease.lease_client import LeaseClient, Question
 from zbridge.lease.lease_events import LeaseEvent

@@ -289,6 +289,17 @@ class Gateway:
         finally:
             self.restarts.device = self._serving = None
 
+    def _authority(self, store: LatchStore) -> Authority:
+        control, bus = self._plan.config.control, self._plan.config.bus
+        return Authority(
+            control.lease_s,
+            control.deadman_s,
+            self._runtime.secret,
+            control.max_age_s,
+            store.load(),
+            alone_is_normal=bus.alone_is_normal,
+        )
+
     def _make_device(self, bus: Bus, audit: Audit, plan: DevicePlan, store: LatchStore) -> RobotDevice:
         near, runtime = self._neighbourhood, self._runtime
         control = self._plan.config.control
@@ -318,9 +329,7 @@ class Gateway:
                 shared=plan.shares,
             ),
             ControlParts(
-                authority=Authority(
-                    control.lease_s, control.deadman_s, runtime.secret, control.max_age_s, store.load()
-                ),
+                authority=self._authority(store),
                 audit=audit,
                 limits=limits,
                 idle_stop_s=control.idle_stop_s,

@@ -16,7 +16,8 @@ from zbridge.errors import BusError, Held, LeaseLost, NeutralFirst, PayloadError
 from zbridge.errors import refusal as refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Acquire, Control, Drive, FleetMessage, Mode, Motor, Raw, Refusal
+from zbridge.fleet.lease_messages import Acquire
+from zbridge.fleet.messages import Control, Drive, FleetMessage, Mode, Motor, Raw, Refusal
 from zbridge.fleet.topics import KeySpace, Topic
 from zbridge.lease.commands import CommandPublishers
 from zbridge.lease.lease_client import LeaseClient

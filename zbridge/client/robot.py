@@ -17,8 +17,8 @@ from zbridge.clocks import raw_ms
 from zbridge.errors import BusError, Malformed, NotReady, Refused, Unsupported, refusal
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
+from zbridge.fleet.lease_messages import Acquire
 from zbridge.fleet.messages import (
-    Acquire,
     Battery,
     Control,
     Devices,

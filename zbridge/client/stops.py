@@ -22,7 +22,8 @@ from zbridge.bus.tls.membership import Right, no_answer, require_right
 from zbridge.errors import BusError, NotReady, PayloadError, Refused, refusal
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Control, Latch, Refusal, Status, Stop, Unlatch
+from zbridge.fleet.lease_messages import Unlatch
+from zbridge.fleet.messages import Control, Latch, Refusal, Status, Stop
 from zbridge.fleet.topics import KeySpace, Topic, split_key
 
 REPEAT_S = 0.25

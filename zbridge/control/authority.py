@@ -33,7 +33,8 @@ from zbridge.control.holders import MAX_AGE_S
 from zbridge.control.latch import Latches, LatchRecord
 from zbridge.control.requests import RefusalCounts
 from zbridge.errors import Refused
-from zbridge.fleet.messages import Acquire, Authorization, Control, Latch, Lease, Stop
+from zbridge.fleet.lease_messages import Acquire, Authorization, Lease
+from zbridge.fleet.messages import Control, Latch, Stop
 from zbridge.lease.proof import Verifier
 from zbridge.protocol.kept import Exported
 
@@ -53,7 +54,10 @@ class Authority:
         random: Callable[[int], bytes],
         max_age_s: float = MAX_AGE_S,
         latches: Latches | None = None,
+        *,
+        alone_is_normal: bool = False,
     ) -> None:
+        self._alone_is_normal = alone_is_normal
         self.latches = latches if latches is not None else Latches()
         self.machine = machine = AuthorityMachine(lease_s, deadman_s, random, max_age_s or math.inf, self.latches)
         self.motion = machine.motion
@@ -192,7 +196,14 @@ class Authority:
             self.machine.handle(Input.HOLDER_LOST, Cause(reason="holder lost"))
 
     def bus_lost(self) -> None:
-        """Record that no program can reach the gateway any more; the lease ends."""
+        """Record that no other process can reach the gateway any more; the lease ends.
+
+        Where others come and go (``alone_is_normal``), a lease whose holder named a liveliness token stays: the token
+        tells whether the holder has left, and one of this process has not.
+        """
+        current = self.holders.current
+        if self._alone_is_normal and current is not None and current.alive is not None:
+            return
         self.machine.handle(Input.BUS_LOST, Cause(reason="bus lost"))
 
     # Time

@@ -27,7 +27,7 @@ from zbridge.control.holders import CommandAge, Holder, Holders
 from zbridge.control.latch import Latches
 from zbridge.control.requests import capped, name_of
 from zbridge.errors import Held, Latched
-from zbridge.fleet.messages import Lease
+from zbridge.fleet.lease_messages import Lease
 from zbridge.lease.proof import Verifier
 from zbridge.machine import step
 

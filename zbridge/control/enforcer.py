@@ -27,7 +27,8 @@ from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import Standstill
 from zbridge.errors import Refused, Stale
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Drive, FleetLatches, FleetMessage, Mode, Motor, Raw
+from zbridge.fleet.lease_messages import FleetLatches
+from zbridge.fleet.messages import Drive, FleetMessage, Mode, Motor, Raw
 from zbridge.fleet.topics import KeySpace
 from zbridge.protocol.session import State
 

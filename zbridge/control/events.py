@@ -8,7 +8,7 @@ from enum import Enum, StrEnum
 import msgspec
 
 from zbridge.errors import Code
-from zbridge.fleet.messages import Acquire, Authorization
+from zbridge.fleet.lease_messages import Acquire, Authorization
 
 
 class AuthorityState(StrEnum):

@@ -20,7 +20,7 @@ import msgspec
 from msgspec import UNSET, UnsetType
 
 from zbridge.errors import Code, Held, LeaseLost, Malformed
-from zbridge.fleet.messages import Acquire, Authorization
+from zbridge.fleet.lease_messages import Acquire, Authorization
 from zbridge.lease.proof import Verifier, read
 
 LEASE_BYTES = 8

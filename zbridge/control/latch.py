@@ -23,7 +23,8 @@ import msgspec
 
 from zbridge.errors import Code, Malformed, PayloadError, ProtocolError, Unsupported
 from zbridge.fleet import payload as payloads
-from zbridge.fleet.messages import FleetLatches, Latch, Stop, StopId
+from zbridge.fleet.lease_messages import FleetLatches
+from zbridge.fleet.messages import Latch, Stop, StopId
 from zbridge.protocol.kept import Exported
 
 LATCHES = 16

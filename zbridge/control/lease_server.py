@@ -16,7 +16,8 @@ from zbridge.errors import Code, Malformed, NotReady, PayloadError, RateLimited,
 from zbridge.errors import refusal as refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Acquire, FleetMessage, Query, Refusals, Unlatch
+from zbridge.fleet.lease_messages import Acquire, Unlatch
+from zbridge.fleet.messages import FleetMessage, Query, Refusals
 from zbridge.lease.lease_events import NAMED
 from zbridge.lease.proof import read
 from zbridge.protocol.rate_limit import RateLimit

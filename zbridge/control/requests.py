@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections import OrderedDict
 
 from zbridge.errors import Code, Malformed, Refused
-from zbridge.fleet.messages import Acquire, Refusal
+from zbridge.fleet.lease_messages import Acquire
+from zbridge.fleet.messages import Refusal
 from zbridge.lease.lease_events import EXPLAINED, NAMED
 
 LEAST_S = 0.01

@@ -13,9 +13,8 @@ from urllib.parse import unquote
 
 import msgspec
 
+from zbridge.fleet.lease_messages import Acquire, Authorization, Unlatch
 from zbridge.fleet.messages import (
-    Acquire,
-    Authorization,
     Battery,
     Control,
     Devices,
@@ -38,7 +37,6 @@ from zbridge.fleet.messages import (
     Stop,
     Switch,
     Text,
-    Unlatch,
 )
 from zbridge.fleet.processes import Stats
 

@@ -15,7 +15,8 @@ from collections.abc import Callable
 
 from zbridge.errors import Code, NotReady, RateLimited, Unsupported
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Acquire, Control, Drive, FleetMessage, Mode, Motor, Raw, Refusal
+from zbridge.fleet.lease_messages import Acquire
+from zbridge.fleet.messages import Control, Drive, FleetMessage, Mode, Motor, Raw, Refusal
 from zbridge.fleet.topics import Topic
 from zbridge.hq.command_queue import CommandQueue
 from zbridge.hq.context import Bridge

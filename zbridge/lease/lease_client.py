@@ -31,7 +31,8 @@ from zbridge.bus import Answer
 from zbridge.errors import BusError, Code, PayloadError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Acquire, Control, Lease, Refusal
+from zbridge.fleet.lease_messages import Acquire, Lease
+from zbridge.fleet.messages import Control, Refusal
 from zbridge.fleet.topics import KeySpace
 from zbridge.lease.lease_events import (
     LeaseEvent,

@@ -11,7 +11,8 @@ import msgspec
 from zbridge.bus import Answer
 from zbridge.errors import BusError, NotReady, PayloadError, RateLimited, Refused, ZbridgeError, refusal
 from zbridge.fleet import payload as payloads
-from zbridge.fleet.messages import Control, Lease, Refusal
+from zbridge.fleet.lease_messages import Lease
+from zbridge.fleet.messages import Control, Refusal
 
 Reply: TypeAlias = Lease | ZbridgeError | None
 """What a question came to: a lease, granted or not; the error instead of one; None: no gateway answered."""

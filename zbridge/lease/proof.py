@@ -21,7 +21,7 @@ import msgspec
 from msgspec import UNSET, UnsetType
 
 from zbridge.errors import Malformed, PayloadError
-from zbridge.fleet.messages import Authorization, Lease
+from zbridge.fleet.lease_messages import Authorization, Lease
 
 PROOF_BYTES = 16
 NOTES = 1024

@@ -13,7 +13,7 @@ from zbridge.control.lease_server import LeaseServer
 from zbridge.errors import BusError, PayloadError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import FleetLatches
+from zbridge.fleet.lease_messages import FleetLatches
 from zbridge.fleet.topics import KeySpace
 
 ASK_S = 1.0

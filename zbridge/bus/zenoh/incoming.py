@@ -19,7 +19,7 @@ from zbridge.bus.writer import Writer
 from zbridge.bus.zenoh.publishers import reply_and_drop
 from zbridge.errors import BusError, PayloadError, Refused, refusal
 from zbridge.fleet import payload as payloads
-from zbridge.fleet.messages import Denied
+from zbridge.fleet.lease_messages import Denied
 from zbridge.fleet.topics import is_concrete
 from zbridge.metrics import Count
 from zbridge.protocol.rate_limit import RateLimit

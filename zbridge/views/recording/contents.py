@@ -20,7 +20,8 @@ import msgspec
 from zbridge.errors import ConfigError, PayloadError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Authorization, FleetMessage, Text
+from zbridge.fleet.lease_messages import Authorization
+from zbridge.fleet.messages import FleetMessage, Text
 from zbridge.fleet.processes import Sessions
 from zbridge.fleet.topics import Topic, split_key
 from zbridge.toml import read_toml

@@ -6,6 +6,8 @@ import subprocess
 from pathlib import Path
 
 ALTERNATIVE = "subjectAltName=DNS:localhost,IP:127.0.0.1"
+SIGNS = "keyUsage=critical,keyCertSign,cRLSign"
+"""Without it Python 3.13 refuses an authority (``ssl.VERIFY_X509_STRICT``)."""
 _KEY = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes")
 
 
@@ -22,7 +24,7 @@ class Authority:
         self.ca, self._key = folder / "ca.pem", folder / "ca.key"
         openssl(
             *("req", "-x509", *_KEY, "-days", "30", "-subj", f"/CN={name}"),
-            *("-keyout", str(self._key), "-out", str(self.ca)),
+            *("-addext", SIGNS, "-keyout", str(self._key), "-out", str(self.ca)),
         )
 
     def issue(self, common_name: str, *, days: int = 5) -> Path:

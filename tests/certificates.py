@@ -6,7 +6,7 @@ import subprocess
 from pathlib import Path
 
 ALTERNATIVE = "subjectAltName=DNS:localhost,IP:127.0.0.1"
-SIGNS = "keyUsage=critical,keyCertSign,cRLSign"
+_SIGNS = ("-addext", "keyUsage=critical,keyCertSign,cRLSign")
 """Without it Python 3.13 refuses an authority (``ssl.VERIFY_X509_STRICT``)."""
 _KEY = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes")
 
@@ -16,15 +16,15 @@ def openssl(*arguments: str) -> None:
 
 
 class Authority:
-    """A certificate authority in a folder."""
+    """A certificate authority in a folder. strict: with the extensions that strict programs demand."""
 
-    def __init__(self, folder: Path, name: str = "lab") -> None:
+    def __init__(self, folder: Path, name: str = "lab", *, strict: bool = True) -> None:
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
         self.ca, self._key = folder / "ca.pem", folder / "ca.key"
         openssl(
             *("req", "-x509", *_KEY, "-days", "30", "-subj", f"/CN={name}"),
-            *("-addext", SIGNS, "-keyout", str(self._key), "-out", str(self.ca)),
+            *(*(_SIGNS if strict else ()), "-keyout", str(self._key), "-out", str(self.ca)),
         )
 
     def issue(self, common_name: str, *, days: int = 5) -> Path:

@@ -139,6 +139,13 @@ def test_a_key_that_others_can_read_is_an_error_that_names_the_command(tmp_path:
     assert [each.code for each in examine_certificate(settings)] == ["ends_soon"]
 
 
+def test_an_authority_that_strict_programs_refuse_is_a_warning_that_names_the_commands(tmp_path: Path) -> None:
+    folder = Authority(tmp_path / "lab", strict=False).issue("viewer.v1", days=90)
+    (finding,) = examine_certificate(folder_settings(folder, ("tls/127.0.0.1:1",)))
+    assert (finding.verdict, finding.code) == (Verdict.WARNING, "not_strict")
+    assert finding.remedy == "`zbridge certs init --force`, then `zbridge certs renew --all`"
+
+
 def test_the_kernels_table_shows_a_port_that_is_open_and_not_one_that_was_closed() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]

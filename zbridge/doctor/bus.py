@@ -11,7 +11,15 @@ from pathlib import Path
 import msgspec
 
 from zbridge.bus import Bus, BusSettings, Tls
-from zbridge.bus.tls.files import ends_soon, out_of_date, own_certificate, unusable, utc_now
+from zbridge.bus.tls.files import (
+    ANOTHER_AUTHORITY,
+    ends_soon,
+    not_strict,
+    out_of_date,
+    own_certificate,
+    unusable,
+    utc_now,
+)
 from zbridge.bus.tls.membership import Right, may, membership
 from zbridge.client import joined as joined
 from zbridge.client.fleet_model import FleetModel, RobotEntry
@@ -61,6 +69,8 @@ def examine_certificate(settings: BusSettings) -> Iterator[Finding]:
         yield error(layer, "out_of_date", date, "renew it, or set this machine's clock")
     elif (date := ends_soon(certificate, utc_now())) is not None:
         yield warning(layer, "ends_soon", date, "renew it in time")
+    elif (strict := not_strict(tls)) is not None:
+        yield warning(layer, "not_strict", strict, ANOTHER_AUTHORITY)
     else:
         yield ok(layer, f"{certificate.common_name}, until {certificate.ends:%Y-%m-%d}")
 

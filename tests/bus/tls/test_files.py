@@ -16,6 +16,7 @@ from zbridge.bus.tls.files import (
     folder_settings,
     folder_tls,
     is_of_authority,
+    not_strict,
     out_of_date,
     tls_beside,
     unusable,
@@ -108,6 +109,18 @@ def test_files_that_do_not_belong_together_are_told(lab: Folder, tmp_path: Path)
         assert unusable(changed(lab, **{field: "no.pem"})) == "no.pem: No such file or directory"
     assert is_of_authority(changed(lab))
     assert not is_of_authority(changed(lab, ca=str(other.ca)))
+
+
+def test_an_authority_that_python_3_13_refuses_is_told_and_used_all_the_same(lab: Folder, tmp_path: Path) -> None:
+    lax = folder_tls(Authority(tmp_path / "lax", strict=False).issue("gateway.g1"))
+    expected = (
+        "Python 3.13 and other strict programs refuse certificates of this authority: CA cert does not include key"
+        " usage extension"
+    )
+    assert (not_strict(lax), unusable(lax), is_of_authority(lax)) == (expected, None, True)
+    assert not_strict(folder_tls(Authority(tmp_path / "strict").issue("gateway.g1"))) is None
+    assert not_strict(changed(lab)) is None
+    assert not_strict(changed(lab, ca=lax.ca)) is None, "of another authority, which is told elsewhere"
 
 
 def test_a_key_with_a_password_is_told_and_nobody_is_asked_for_it(lab: Folder, tmp_path: Path) -> None:

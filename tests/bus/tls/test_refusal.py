@@ -109,6 +109,14 @@ def test_a_router_that_takes_our_certificate_is_there_but_silent(lab: Authority)
     assert found == ("HUB takes our certificate, but answers nothing", False)
 
 
+def test_an_authority_without_key_usage_is_trusted_by_every_python_as_zenoh_does(tmp_path: Path) -> None:
+    lax = Authority(tmp_path, strict=False)
+    for name in ("router.hub", "gateway.g1"):
+        lax.issue(name)
+    found = asked(router(member(lax, "router.hub")), member(lax, "gateway.g1"))
+    assert found == ("HUB takes our certificate, but answers nothing", False)
+
+
 def test_a_router_of_another_authority_is_not_trusted_and_does_not_trust_us(lab: Authority, other: Authority) -> None:
     ours = member(lab, "gateway.g1")
     expected = f"the certificate of the router at HUB is of another authority than {ours.ca}"

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
+import ssl
 import stat
 from collections.abc import Callable
 from datetime import timedelta
+from typing import Any
 
 import pytest
 from cryptography import x509 as cx509
@@ -19,6 +22,7 @@ from zbridge.security.certs import authority
 from zbridge.security.files import changing
 from zbridge.security.roles import OF_ROBOTS, ROLES, Member, Role, Roles, load_roles, save_roles
 
+NO_CHECK_TIME = 0x200000  # OpenSSL's flag: the time of these tests stands still
 CLIENT, SERVER = ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH
 
 WRONG_REQUESTS = [
@@ -57,6 +61,51 @@ def test_an_authority_signs_certificates_for_ten_years_and_nothing_below_them(la
     assert (constraints.critical, constraints.value.ca, constraints.value.path_length) == (True, True, 0)
     assert made.extensions.get_extension_for_class(cx509.KeyUsage).value.key_cert_sign
     assert load_roles(lab.folder.roles) == Roles()
+
+
+def extension(certificate: cx509.Certificate, kind: type[Any]) -> tuple[bool, Any]:
+    found = certificate.extensions.get_extension_for_class(kind)
+    return found.critical, found.value
+
+
+@pytest.mark.parametrize(("role", "hosts"), [("router", ("localhost",)), ("viewer", ())])
+def test_authority_and_certificates_have_the_extensions_that_strict_programs_demand(
+    lab: Lab, role: Role, hosts: tuple[str, ...]
+) -> None:
+    ca = cx509.load_pem_x509_certificate(lab.folder.ca.read_bytes())
+    critical, usages = extension(ca, cx509.KeyUsage)
+    assert (critical, usages.key_cert_sign, usages.crl_sign) == (True, True, True)
+    lab.issue("it", role, hosts=hosts)
+    made = lab.certificate("it")
+    for certificate in (ca, made):
+        assert extension(certificate, cx509.BasicConstraints)[0], "critical"
+        assert extension(certificate, cx509.KeyUsage)[0], "critical"
+        own = cx509.SubjectKeyIdentifier.from_public_key(certificate.public_key())
+        assert extension(certificate, cx509.SubjectKeyIdentifier) == (False, own)
+    _, issuer = extension(made, cx509.AuthorityKeyIdentifier)
+    assert issuer.key_identifier == extension(ca, cx509.SubjectKeyIdentifier)[1].digest
+    assert certificate.version is ca.version is cx509.Version.v3
+
+
+@pytest.mark.parametrize("router_is", ["server", "client"])
+def test_a_strict_handshake_as_python_3_13_makes_it_succeeds_on_every_python(lab: Lab, router_is: str) -> None:
+    lab.issue("hub", "router", hosts=("localhost", "127.0.0.1"))
+    lab.issue("ann", hosts=("localhost",))
+    names = ("hub", "ann") if router_is == "server" else ("ann", "hub")
+    contexts = (ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), ssl.create_default_context())
+    for context, name in zip(contexts, names, strict=True):
+        context.verify_mode = ssl.CERT_REQUIRED
+        context.verify_flags |= ssl.VERIFY_X509_STRICT | ssl.VERIFY_X509_PARTIAL_CHAIN | NO_CHECK_TIME
+        context.load_verify_locations(lab.folder.ca)
+        context.load_cert_chain(lab.folder.of(name).certificate, lab.folder.of(name).key)
+    to_server, to_client = ssl.MemoryBIO(), ssl.MemoryBIO()
+    server = contexts[0].wrap_bio(to_server, to_client, server_side=True)
+    client = contexts[1].wrap_bio(to_client, to_server, server_hostname="localhost")
+    for _ in range(3):
+        for end in (client, server):
+            with contextlib.suppress(ssl.SSLWantReadError):
+                end.do_handshake()
+    assert [dict(end.getpeercert()["subject"][0])["commonName"].split(".")[1] for end in (client, server)] == [*names]
 
 
 def test_two_authorities_have_different_names(lab: Lab) -> None:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from datetime import datetime, timedelta
 
 import pytest
+from cryptography import x509 as cx509
 from cryptography.hazmat.primitives import hashes
+from cryptography.x509.oid import NameOID
 
 from tests.security.certs.lab import Lab
 from zbridge.errors import ConfigError
-from zbridge.security.certs import authority
+from zbridge.security.certs import authority, x509
 from zbridge.security.certs.authority import ListedCertificate, list_names
 from zbridge.security.roles import Member, Roles, save_roles
 
@@ -72,6 +75,31 @@ AGES = [
 def test_the_age_of_a_certificate_is_told(lab: Lab, days: float, problem: str) -> None:
     lab.issue("ann")
     assert entry(lab.later(days), "ann").problem == problem
+
+
+def test_an_authority_that_strict_programs_refuse_is_told_with_the_remedy_which_helps(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patched:
+        patched.setattr(x509, "new_authority", without_key_usage)
+        authority.init(lab.folder, lab.now, force=True)
+    lab.issue("ann")
+    assert entry(lab, "ann").problem == (
+        "Python 3.13 and other strict programs refuse certificates of this authority: CA cert does not include key"
+        " usage extension; `zbridge certs init --force`, then `zbridge certs renew --all`"
+    )
+    authority.init(lab.folder, lab.now, force=True)
+    authority.renew(lab.folder, "ann", lab.now)
+    assert entry(lab, "ann").problem == ""
+
+
+def without_key_usage(now: datetime, days: int) -> x509.CertificateAuthority:
+    key, name = x509.new_key(), cx509.Name([cx509.NameAttribute(NameOID.COMMON_NAME, "old")])
+    builder = cx509.CertificateBuilder(name, name, key.public_key(), 7, now, now + timedelta(days=days))
+    constraints = cx509.BasicConstraints(ca=True, path_length=None)
+    identifier = cx509.SubjectKeyIdentifier.from_public_key(key.public_key())
+    builder = builder.add_extension(constraints, critical=True).add_extension(identifier, critical=False)
+    return x509.CertificateAuthority(builder.sign(key, hashes.SHA256()), key)
 
 
 def test_the_list_needs_no_key_of_the_authority(lab: Lab) -> None:

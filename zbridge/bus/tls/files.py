@@ -23,6 +23,8 @@ WARN = timedelta(days=30)
 """How long before a certificate expires there is a warning."""
 TLS_VARIABLE = "ZBRIDGE_TLS"
 """The environment variable that names a folder if no option does."""
+ANOTHER_AUTHORITY = "`zbridge certs init --force`, then `zbridge certs renew --all`"
+"""What to do about an authority that is not good."""
 _NO_CHECK_TIME = 0x200000
 """OpenSSL's flag: a chain is checked without its dates."""
 _FLIGHTS = 10
@@ -136,10 +138,27 @@ def client_context(tls: Tls) -> ssl.SSLContext:
 
 def is_of_authority(tls: Tls) -> bool:
     """Return whether the authority has signed the certificate, whatever the time is, by a handshake in memory."""
+    return _chain_fault(tls) is None
+
+
+def not_strict(tls: Tls) -> str | None:
+    """Return why programs that verify strictly refuse certificates of the authority; None if they do not.
+
+    Python does by default, from 3.13 on. Zenoh and zbridge do not: a bus works with such an authority. The remedy is
+    :data:`ANOTHER_AUTHORITY`. Expects usable files. Returns None also for a certificate of another authority.
+    """
+    if not is_of_authority(tls):
+        return None
+    fault = _chain_fault(tls, ssl.VERIFY_X509_STRICT)
+    return fault and f"Python 3.13 and other strict programs refuse certificates of this authority: {fault}"
+
+
+def _chain_fault(tls: Tls, flags: int = 0) -> str | None:
+    """Return why a server with the authority refuses the certificate, whatever the time is; None if it does not."""
     server, client = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     client.check_hostname, client.verify_mode = False, ssl.CERT_NONE
     server.verify_mode = ssl.CERT_REQUIRED
-    server.verify_flags |= _NO_CHECK_TIME
+    server.verify_flags |= _NO_CHECK_TIME | flags
     _load_authority(server, tls)
     for context in (server, client):
         _load_own(context, tls)
@@ -150,9 +169,11 @@ def is_of_authority(tls: Tls) -> bool:
             for end in ends:
                 with contextlib.suppress(ssl.SSLWantReadError):
                     end.do_handshake()
-    except ssl.SSLError:
-        return False
-    return ends[1].getpeercert() is not None
+    except ssl.SSLCertVerificationError as error:
+        return error.verify_message
+    except ssl.SSLError as error:
+        return error.reason or str(error)
+    return None if ends[1].getpeercert() is not None else "no certificate was shown"
 
 
 def _load_authority(context: ssl.SSLContext, tls: Tls) -> None:

@@ -14,6 +14,7 @@ import msgspec
 from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
 from cryptography.x509 import Certificate
 
+from zbridge.bus.tls.files import ANOTHER_AUTHORITY, folder_tls, not_strict
 from zbridge.errors import ConfigError
 from zbridge.security.certs import x509
 from zbridge.security.files import PUBLIC, SECRET, Folder, changing, make_folder, read, refuse_to_overwrite, write
@@ -243,8 +244,15 @@ def _entry(folder: Folder, authority: Certificate, roles: Roles, name: str, now:
         x509.hosts_of(certificate),
         certificate.not_valid_after_utc,
         x509.fingerprint(certificate),
-        fault(certificate, authority, roles.common_name(name), now) or _warning(certificate, now),
+        fault(certificate, authority, roles.common_name(name), now)
+        or _authority_warning(folder, name)
+        or _warning(certificate, now),
     )
+
+
+def _authority_warning(folder: Folder, name: str) -> str:
+    strict = not_strict(folder_tls(folder.of(name).folder))
+    return f"{strict}; {ANOTHER_AUTHORITY}" if strict else ""
 
 
 def _warning(certificate: Certificate, now: datetime) -> str:

@@ -151,7 +151,7 @@ def test_text_requests_are_read_and_unknown_fields_ignored() -> None:
         '{"op":"subscribe","subscriptions":[{"id":-1,"channelId":3}]}',
         '{"op":"unsubscribe","subscriptionIds":["a"]}',
         '{"op":"unadvertise","channelIds":[' + "1," * 5000 + "1]}",
-        '{"op":"setParameters","parameters":[{"name":"x","value":' + "[" * 5000 + "]" * 5000 + "}]}",
+        '{"op":"setParameters","parameters":[{"name":"x","value":' + "[" * 100_000 + "]" * 100_000 + "}]}",
     ],
 )
 def test_spoiled_text_is_malformed(text: str) -> None:

@@ -248,7 +248,9 @@ class RobotCommands(ViewerCommands):
     async def _set(self, viewer: Subscriber, robot: str, what: str, value: Any) -> None:
         expected = _MODES if what == "mode" else (True, False)
         if not isinstance(value, bool | str) or value not in expected:
-            raise Malformed(f"{what} = {value!r:.40}: expected one of {', '.join(map(repr, expected))}")
+            nested = isinstance(value, list | dict)  # perhaps deeper than repr allows
+            found = f"a {type(value).__name__}" if nested else f"{value!r:.40}"
+            raise Malformed(f"{what} = {found}: expected one of {', '.join(map(repr, expected))}")
         if what == "mode":
             await self._set_mode(viewer, robot, str(value))
         else:

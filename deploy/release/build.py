@@ -51,9 +51,17 @@ def build(source: Path, kind: str, epoch: str) -> Path:
     """Build a wheel or an sdist of a folder with the installed hatchling."""
     output = source / "dist"
     command = [sys.executable, "-m", "hatchling", "build", "-t", kind, "-d", str(output)]
-    subprocess.run(
-        command, cwd=source, check=True, stdout=subprocess.DEVNULL, env={**os.environ, "SOURCE_DATE_EPOCH": epoch}
+    done = subprocess.run(
+        command,
+        cwd=source,
+        check=False,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env={**os.environ, "SOURCE_DATE_EPOCH": epoch},
     )
+    if done.returncode != 0:
+        raise Unsound(f"{' '.join(command)}:\n{done.stdout}")
     (built,) = output.glob("*.whl" if kind == "wheel" else "*.tar.gz")
     return built
 

@@ -89,7 +89,7 @@ def test_pre_commit_runs_the_lint_of_ci() -> None:
     hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"][0]["hooks"]
     script = (ROOT / ".ci" / "run").read_text()
     assert [hook["name"] for hook in hooks] == ["ruff check", "ruff format --check", "mypy", "lint-imports"]
-    assert all(re.search(rf"^{hook['name']}\b", script, re.MULTILINE) for hook in hooks)
+    assert all(re.search(rf"^ *{hook['name']}\b", script, re.MULTILINE) for hook in hooks)
     assert all(hook["entry"].startswith(hook["name"]) and hook["language"] == "system" for hook in hooks)
 
 

@@ -13,7 +13,9 @@ other() { # VERSION: builds the wheel of another version from the code in $work/
 }
 for version in 0.1.1 0.1.2; do
     mkdir "$work/$version"
+    mkdir -p "$work/$version/deploy/release"
     cp -r "$root"/{pyproject.toml,README.md,LICENSE,zbridge,gateways} "$work/$version/"
+    cp "$root/deploy/release/zbridge.cdx.json" "$work/$version/deploy/release/"
 done
 # 0.1.1 is recognized by what its gateways answer; the gateways of 0.1.2 do not start.
 sed -i 's/; version=0.0.4/; version=0.0.4; zbridge=0.1.1/' "$work/0.1.1/zbridge/app/prometheus.py"

@@ -11,17 +11,17 @@ other() { # VERSION: builds the wheel of another version from the code in $work/
     sed -i "s/^version = .*/version = \"$1\"/" "$work/$1/pyproject.toml"
     wheel "$work/later-$1" --no-deps "$work/$1"
 }
-for version in 0.1.1 0.1.2; do
+for version in 0.2.1 0.2.2; do
     mkdir "$work/$version"
     mkdir -p "$work/$version/deploy/release"
     cp -r "$root"/{pyproject.toml,README.md,LICENSE,zbridge,gateways} "$work/$version/"
     cp "$root/deploy/release/zbridge.cdx.json" "$work/$version/deploy/release/"
 done
-# 0.1.1 is recognized by what its gateways answer; the gateways of 0.1.2 do not start.
-sed -i 's/; version=0.0.4/; version=0.0.4; zbridge=0.1.1/' "$work/0.1.1/zbridge/app/prometheus.py"
-echo 'raise RuntimeError("a broken version")' >>"$work/0.1.2/zbridge/app/gateway.py"
-other 0.1.1
-other 0.1.2
+# 0.2.1 is recognized by what its gateways answer; the gateways of 0.2.2 do not start.
+sed -i 's/; version=0.0.4/; version=0.0.4; zbridge=0.2.1/' "$work/0.2.1/zbridge/app/prometheus.py"
+echo 'raise RuntimeError("a broken version")' >>"$work/0.2.2/zbridge/app/gateway.py"
+other 0.2.1
+other 0.2.2
 
 host=$work/host
 debian "$host" ca-certificates,systemd,systemd-sysv,dbus,python3-venv,iproute2,procps

@@ -7,6 +7,7 @@ with the code, and needs neither dot nor fonts.
 import sys
 from pathlib import Path
 
+from docs.diagrams import badges
 from docs.diagrams.bus import architecture, drive, roles
 from docs.diagrams.dot import Graph
 from docs.diagrams.lease import lease
@@ -23,6 +24,9 @@ GALLERY |= {name: draw(machine) for name, machine in MACHINES.items()}
 
 if __name__ == "__main__":
     FOLDER.mkdir(parents=True, exist_ok=True)
+    badges.FOLDER.mkdir(exist_ok=True)
+    for name, text in badges.badges().items():
+        (badges.FOLDER / f"{name}.svg").write_text(text)
     for name, drawing in GALLERY.items():
         path = FOLDER / f"{name}.svg"
         if "--all" in sys.argv or not path.exists() or source_in(path.read_text()) != drawing.source:

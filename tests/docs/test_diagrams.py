@@ -10,6 +10,8 @@ from xml.etree import ElementTree
 import pytest
 
 from docs.diagrams.__main__ import FOLDER, GALLERY
+from docs.diagrams.badges import FOLDER as BADGES
+from docs.diagrams.badges import badges
 from docs.diagrams.bus import RIGHTS, STEPS, may
 from docs.diagrams.dot import Graph
 from docs.diagrams.lease import LOST_DRIVER, SETTINGS, TAKEOVER, play
@@ -35,6 +37,11 @@ def file(name: str) -> str:
 @every_diagram
 def test_a_diagram_is_up_to_date(name: str) -> None:
     assert source_in(file(name)) == GALLERY[name].source, UP_TO_DATE
+
+
+@pytest.mark.parametrize("name", badges())
+def test_a_badge_says_what_the_project_declares(name: str) -> None:
+    assert (BADGES / f"{name}.svg").read_text() == badges()[name], UP_TO_DATE
 
 
 @every_diagram

@@ -13,17 +13,20 @@ from zbridge.host.settings import HostSettings
 from zbridge.protocol.plugin import find_protocol, protocol_names
 from zbridge.security.router_settings import RouterSettings
 from zbridge.toml import convert
+from zbridge.views.ros2.settings import Ros2Settings
 
 OTHERS = {"build-system", "users"}
 """First tables of files that are not ours, or that a command writes."""
 
 
-def check(raw: dict[str, Any], *, whole: bool) -> None:
-    """Raise ConfigError if the product would refuse these tables."""
+def check(raw: dict[str, Any], name: str, *, whole: bool) -> None:
+    """Raise ConfigError if the product would refuse these tables. name: of the file."""
     if OTHERS & set(raw):
         return
     if "host" in raw:
         convert(raw["host"], HostSettings, "host.")
+    elif name == "ros2.toml":
+        convert(raw, Ros2Settings)
     elif {"roles", "limits", "listen"} & set(raw):
         convert(raw, RouterSettings)
     elif whole:
@@ -49,4 +52,5 @@ def check_part(raw: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    check(tomllib.loads(Path(sys.argv[2]).read_text()), whole=sys.argv[1] == "--whole")
+    file = Path(sys.argv[2])
+    check(tomllib.loads(file.read_text()), file.name, whole=sys.argv[1] == "--whole")

@@ -1,6 +1,6 @@
 """The blocks of a page: what it tells to type, the files it shows, and what a run of it must know.
 
-A comment on the line above a block says how it is run:
+A comment between the block before and this one says how it is run:
 
 ``<!-- run: background -->``, ``background until TEXT``: its last command runs until the page ends; it is ready when
 TEXT is in its output. ``setup COMMAND``, ``setup COMMAND until TEXT``: a hidden command in the background before it.
@@ -26,7 +26,6 @@ LISTED = ("toml", "python", "yaml", "ini", "json5", "json")
 SHOWN = ("text",)
 
 _BLOCK = re.compile(
-    r"(?P<above>(?:^ *<!-- run: [^\n]*-->\n)*)"
     r"^(?P<indent> *)```(?P<language>\w*)(?P<info>[^\n`]*)\n(?P<text>.*?)^(?P=indent)```$",
     re.MULTILINE | re.DOTALL,
 )
@@ -56,11 +55,13 @@ class Block:
 
 def blocks(page: str) -> Iterator[Block]:
     """Give the blocks of a page in their order."""
+    end = 0
     for match in _BLOCK.finditer(page):
+        above, end = page[end : match.start()], match.end()
         title = _TITLE.search(match["info"])
         indent = match["indent"]
         text = "".join(line.removeprefix(indent) for line in match["text"].splitlines(keepends=True))
-        how = tuple((word, argument or "") for word, argument in _RUN.findall(match["above"]))
+        how = tuple((word, argument or "") for word, argument in _RUN.findall(above))
         line = page.count("\n", 0, match.start("language")) + 1
         yield Block(line, match["language"], title[1] if title else None, text, how)
 

@@ -20,7 +20,7 @@ RUN = [
     if page != GUIDE and any(block.language not in SHOWN and not block.not_here for block in blocks(page.read_text()))
 ]
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-NOT_PROGRAMS = ("sudo", "export", "cd")
+NOT_PROGRAMS = ("sudo", "export", "cd", "echo", "git")
 NOT_ON_TEST_MACHINES = {"apt", "ros2", "ros2bag", "rviz2"}
 """Programs of ROS and of its installation; every other command is run somewhere."""
 PAGE_S = 240

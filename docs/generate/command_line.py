@@ -20,17 +20,19 @@ BUS = ("--connect", "--realm", "--tls")
 """Options of every command that joins the bus; ``zbridge ls`` has all of them, and their help."""
 
 
-def commands(group: TyperGroup, path: str = "zbridge") -> Iterator[tuple[str, TyperCommand]]:
-    """Give every command with its name, in the order of the help."""
+def commands(group: TyperGroup, path: str = "zbridge") -> Iterator[tuple[str, TyperCommand | TyperGroup]]:
+    """Give every command with its name, in the order of the help; a group too, if it does something by itself."""
     for name in group.list_commands(typer.Context(group)):
         command = group.commands[name]
         if isinstance(command, TyperGroup):
+            if command.invoke_without_command:
+                yield f"{path} {name}", command
             yield from commands(command, f"{path} {name}")
         elif isinstance(command, TyperCommand) and not command.hidden:
             yield f"{path} {name}", command
 
 
-def one(name: str, command: TyperCommand, shared: set[str]) -> str:
+def one(name: str, command: TyperCommand | TyperGroup, shared: set[str]) -> str:
     """Write one command. shared: the helps of the options of the bus."""
     pieces = command.collect_usage_pieces(typer.Context(command, info_name=name))
     usage = " ".join([name, *pieces]).replace("{", "").replace("}", "")

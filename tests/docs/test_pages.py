@@ -1,4 +1,7 @@
-"""Every command and listing that a page tells to type is run, and every output that it shows is compared."""
+"""Every command and listing that a page tells to type is run, and every output that it shows is compared.
+
+The runs take minutes, and have a command of their own: ``pytest -m pages``.
+"""
 
 from __future__ import annotations
 
@@ -31,6 +34,7 @@ def name(page: Path) -> str:
 
 
 @pytest.mark.e2e
+@pytest.mark.pages
 @pytest.mark.parametrize("page", RUN, ids=name)
 def test_what_a_page_tells_to_type_works_from_top_to_bottom(page: Path) -> None:
     try:

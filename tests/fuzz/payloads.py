@@ -14,7 +14,7 @@ from zbridge.app.handover import channel as handover
 from zbridge.control.admission import is_stop
 from zbridge.control.latch import STOPS, Latches, LatchRecord, read_stop
 from zbridge.errors import LinkError, Malformed, PayloadError, ProtocolError, Unsupported
-from zbridge.fleet import messages, payload, processes, topics
+from zbridge.fleet import lease_messages, messages, payload, processes, topics
 from zbridge.fleet.lease_messages import Authorization
 from zbridge.fleet.messages import FleetMessage, Stop
 from zbridge.fleet.payload import with_stamp
@@ -35,7 +35,7 @@ from zbridge.views.ros2.settings import RobotBody
 KINDS = sorted(
     {
         kind
-        for kind in (*vars(messages).values(), *vars(processes).values())
+        for kind in (*vars(messages).values(), *vars(lease_messages).values(), *vars(processes).values())
         if isinstance(kind, type) and issubclass(kind, FleetMessage)
     },
     key=lambda kind: kind.__name__,

@@ -136,7 +136,9 @@ def check(
     tls: FileTls = None,
     json: Json = False,
 ) -> None:
-    """Check a configuration, or all of a directory, and print what they would run.
+    """Check a configuration, or all of a directory, and print what they would run; also its certificate.
+
+    An error names the faulty key, or the gateway of this machine that has the robot's address.
 
     Exit code 2: one is faulty.
     """
@@ -301,6 +303,8 @@ def demo(
     ] = False,
 ) -> None:
     """Show a simulated robot of each protocol, their gateways, a router and a live table; loopback only.
+
+    With the extra zbridge[console] it serves the console too, and prints its address.
 
     Exit code 1: with --seconds, a robot sent no data.
     """

@@ -26,6 +26,8 @@ NAMES = ("hub.lab", "hub", "gateway.lab", "console.lab", "router.lab", "router-1
 ADDRESSES = ("192.168.0.2/16", "192.168.0.10/32", "192.168.0.11/32", "192.168.1.11/32", "10.77.0.1/24", "10.77.0.2/32")
 COMMAND_S = 60.0
 READY_S = 20.0
+READS_S = 0.7
+"""Seconds that the quickest reader needs from what a command says to the next one."""
 AGAIN = re.compile(r"zbridge (ls|health|top|doctor|echo|check|info)\b")
 """What only looks, and may be typed again until what it looks at is there."""
 AGAIN_S = 12.0
@@ -76,7 +78,8 @@ class Page:
         try:
             yield
         except (OSError, subprocess.TimeoutExpired, PageError) as error:
-            raise PageError(f"{self._path.relative_to(ROOT)}:{block.line}: {error}") from error
+            logs = (f"-- in the background:\n{log.read_text()[-1500:]}" for log in self._state.glob("background-*"))
+            raise PageError("\n".join([f"{self._path.relative_to(ROOT)}:{block.line}: {error}", *logs])) from error
 
     def _block(self, block: Block) -> None:
         if block.title is not None:
@@ -178,6 +181,7 @@ class Page:
             if process.poll() is not None:
                 raise PageError(f"ended with exit code {process.returncode}\n$ {command}\n{log.read_text()}")
             if until and until in log.read_text():
+                time.sleep(READS_S)
                 return
             time.sleep(0.05)
         if until:

@@ -82,7 +82,7 @@ def test_what_is_run_elsewhere_is_named_there(page: Path) -> None:
         assert reason, f"line {block.line}: no reason"
         assert (ROOT / path).exists(), f"line {block.line}: {path}"
         text = "\n".join(file.read_text() for file in files(ROOT / path))
-        for program in programs(block):
+        for program in programs(block) | scripts(block):
             assert re.search(rf"\b{re.escape(program)}\b", text), f"line {block.line}: {path} runs no {program}"
 
 
@@ -95,6 +95,11 @@ def test_what_is_run_nowhere_is_of_programs_that_no_test_machine_has(page: Path)
 
 def files(path: Path) -> list[Path]:
     return [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
+
+
+def scripts(block: Block) -> set[str]:
+    """Give the scripts of the project that a block names."""
+    return {Path(word).name for word in block.text.split() if re.fullmatch(r"deploy/[\w/]+\.sh", word)}
 
 
 def programs(block: Block) -> set[str]:

@@ -39,18 +39,18 @@ HQ_TEMPLATE = """\
 protocol = "tcpudp"
 listen = "tcp://127.0.0.1:11002"        # clients bind UDP 11000, and receive datagrams from this address and port only
 [hq.options]
-versions = ["1.1", "1.2", "1.3"]        # sent to the letter; programs of 1.1 or 1.2 understand only ["1.1"] or ["1.2"]
+versions = ["1.1", "1.2", "1.3"]        # sent verbatim; programs of 1.1 or 1.2 understand only ["1.1"] or ["1.2"]
 udp = true                              # offer datagrams: 1.3 programs drive by nothing else
 client_port = 11000                     # the UDP port that programs bind: one whose packet 5 was lost is accepted
                                         # from there alone; 0: from nowhere
 gap_s = 0.01                            # least time between two packets: programs take one read as one packet
-quiet_s = 2.0                           # before a client's id is given again
+quiet_s = 2.0                           # time before the id of a client that left is given to another one
 known = []                              # packet ids that these programs know besides those of their version
 unasked = false                         # maps and positions (53, 55) also to programs of 1.1 that asked for none
                                         # (52, 54): its first ones have no handlers for them
 skip_map_flag = false                   # leave out the byte that some 1.3 programs skip, so that they see the map size
-slam_map_size = 1000                    # announced while the robot's map is not known yet, in its unit of length
-slam_map_interval = 10                  # the side of its cells, likewise
+slam_map_size = 1000                    # map size announced while the robot's map is unknown, in its unit of length
+slam_map_interval = 10                  # cell size announced while the robot's map is unknown
 speed_full = 1.0                        # packet speed at full scale
 turn_full = 1.0                         # packet turn speed at full scale
 length_unit_m = 0.01                    # the programs' unit of length in metres

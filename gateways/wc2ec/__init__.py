@@ -25,7 +25,7 @@ dialect = "deployed"                    # what programs in the field speak; "dra
 motor_types = { rotational = [53], linear = [46] }  # type bytes that are motors; they move with the Webots version
 # motors = { rotational = ["wheel1"], linear = [] }  # names that are motors, whatever their type byte
 # bounds_default = [0.0, 1000.0]        # readings outside are faults; these bounds are the legacy application's
-# bounds = { front = [-1.0, 5000.0] }   # others for some sensors
+# bounds = { front = [-1.0, 5000.0] }   # bounds of single sensors, in place of bounds_default
 # tables = { front = [[0.0, 1.0], [1000.0, 0.02]] }  # from a sensor's value to metres (or irradiance), interpolated
 # bearings_deg = { front = 0.0, left = 90.0 }  # directions of distance sensors, counter-clockwise: they make a scan
 # scan_range_m = [0.0, 10.0]            # least and most distance that the scan reports
@@ -52,9 +52,9 @@ join_s = 0.03                           # a controller sets "left" and "right" o
                                         # this time is one drive; a stop never waits
 sectors = 8                             # a scan is shown as so many distance sensors, sector0 ahead, counter-clockwise
 sector_unit_m = 1.0                     # what their value 1 is in metres
-distance_type = 37                      # type bytes; they move with the Webots version
-rotational_type = 53                    # likewise
-linear_type = 46                        # likewise
+distance_type = 37                      # type byte of distance sensors; it moves with the Webots version
+rotational_type = 53                    # type byte of rotational motors; it moves with the Webots version
+linear_type = 46                        # type byte of linear motors; it moves with the Webots version
 # devices = [{ name = "light0", number = 0 }]  # draft only: the sensors there are, by their names on the bus
 values = 3                              # draft only: configuration values of a sensor
 

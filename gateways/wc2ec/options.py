@@ -22,7 +22,7 @@ Number = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
 class DeviceOption(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A device of the draft dialect, which has no names on the wire.
 
-    name: on the bus. number: on the wire. kind: of the device.
+    name: on the bus. number: the number on the wire. kind: of the device.
     """
 
     name: str
@@ -33,7 +33,7 @@ class DeviceOption(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class WheelMotors(Differential, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Two sides of wheels: how a drive moves the robot.
 
-    left, right: the names of their motors. wheel_radius_m: of the wheels.
+    left, right: names of the motors. wheel_radius_m: radius of the wheels.
     """
 
     left: tuple[str, ...]
@@ -44,7 +44,7 @@ class WheelMotors(Differential, frozen=True, forbid_unknown_fields=True, kw_only
 class MotorTypes(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Type bytes that are motors.
 
-    rotational, linear: of these motors.
+    rotational: type bytes of rotational motors. linear: type bytes of linear motors.
     """
 
     rotational: tuple[Byte, ...] = (53,)
@@ -54,7 +54,7 @@ class MotorTypes(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class MotorNames(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Names that are motors, whatever their type byte.
 
-    rotational, linear: of these motors.
+    rotational: names of rotational motors. linear: names of linear motors.
     """
 
     rotational: tuple[str, ...] = ()
@@ -110,7 +110,7 @@ def require_devices(dialect: str, devices: tuple[DeviceOption, ...]) -> None:
 class Wheels(Differential, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The motors "left" and "right" that are shown of a robot without motors.
 
-    wheel_radius_m: of the wheels. track_m: between the sides.
+    wheel_radius_m: radius of the wheels. track_m: distance between the left and the right wheels.
     """
 
     wheel_radius_m: Positive = 0.05

@@ -93,7 +93,7 @@ CAMERA_TEMPLATE = """\
 # rate_hz = 30.0                        # most pictures a second on the bus
 # stall_s = 5.0                         # a stream without a picture for so long is ended, and fetched anew
 # relay = "127.0.0.1:8000"              # HQ programs find /stream.mjpg here, all from one connection to the robot
-# clients = 16                          # most of them at a time
+# clients = 16                          # most clients of the relay at a time
 # allow = []                            # networks that they may connect from, ["192.168.1.0/24"]; empty: all
 
 """
@@ -113,12 +113,12 @@ deadman_s = 2.0                         # most a holder may ask for: motion with
 max_age_s = 0.4                         # motion that the network delayed longer is refused; 0: off
 # rate_hz = 50.0                        # drives a second that are carried out; further ones are refused
 # slew_per_s = 2.0                      # how fast a drive may grow, full scales a second; braking is not limited
-idle_stop_s = 1.0                       # seconds between stops while nobody drives, in case the robot lost one;
-                                        # 0: a stop only when motion ends
-audit = "{name}.audit.jsonl"                # who drove, was refused or stopped it: a file in the working directory,
-audit_bytes = 1000000                   # rotated at this size,
-audit_files = 5                         # with so many older ones kept,
-audit_days = 30.0                       # and up to 20 times as many that are younger than this
+idle_stop_s = 1.0                       # seconds between stops while nobody drives, in case the robot lost one: 0.1
+                                        # or more; 0: a stop only when motion ends
+audit = "{name}.audit.jsonl"                # file that says who drove, was refused or stopped the robot
+audit_bytes = 1000000                   # the file is rotated at this size
+audit_files = 5                         # older files that are always kept
+audit_days = 30.0                       # further ones are kept until they are so old, 20 times as many at most
 
 """
     + METRICS_TEMPLATE

@@ -30,7 +30,7 @@ six sessions never reconnected after 4 of 33 cuts of the network (eclipse-zenoh/
 class Tls(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Files for mutual TLS.
 
-    ca: the authority's certificate. certificate: our own. key: of our certificate.
+    ca: the authority's certificate. certificate: this program's. key: the private key of that certificate.
     """
 
     ca: str

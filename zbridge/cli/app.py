@@ -103,7 +103,9 @@ def run(
 ) -> None:
     """Run a gateway in the foreground until SIGTERM or SIGINT; for a directory or several files, one process per file.
 
-    SIGUSR2 restarts a gateway without dropping its connections.
+    SIGUSR2 restarts a gateway without dropping its connections. For a directory, several files or --watch, a supervisor
+    restarts gateways that die or hang, and stops their robots; at SIGHUP it reads the files and the installed code
+    again. One FILE without --watch is not monitored.
     """
     host = load_host(files[0]) if len(files) == 1 and files[0].is_dir() else HostSettings()
     if together or host.together:

@@ -193,12 +193,14 @@ def _left_out(error: ZbridgeError) -> str:
 
 
 def _is_whole(name: str) -> bool:
-    """Return whether a protocol can be loaded, and what its robots need is installed; print why it cannot be loaded."""
+    """Return whether a protocol can be loaded, and what its robots need is installed; print what is missing."""
     try:
-        return all(find_spec(module) is not None for module in find_protocol(name).requires)
+        if all(find_spec(module) is not None for module in find_protocol(name).requires):
+            return True
+        _left_out(ConfigError(f"{name}: pip install 'zbridge[{name}]' installs what its robots need"))
     except ConfigError as error:
         _left_out(error)
-        return False
+    return False
 
 
 def _how_to_connect(protocol: Protocol, listener: str) -> str:

@@ -106,7 +106,9 @@ def export(
 @app.command()
 def mark(
     text: Annotated[str, typer.Argument(help="what happened", show_default=False)],
-    who: Annotated[str, typer.Option(help="author of the mark; user@host by default")] = "",
+    who: Annotated[
+        str, typer.Option(help="author of the mark; by default the name in the certificate, else user@host")
+    ] = "",
     connect: Connect = [],
     tls: TlsFolder = None,
     realm: Realm = "fleet",

@@ -147,7 +147,9 @@ def echo(
 def drive(
     robot: Annotated[str, typer.Argument(help="the robot's name", show_default=False)],
     speed: Annotated[float, typer.Option(help="fraction of full scale", min=0.1, max=1.0)] = 0.3,
-    who: Annotated[str, typer.Option(help="shown to others as the driver; user@host by default")] = "",
+    who: Annotated[
+        str, typer.Option(help="shown to others as the driver; by default the name in the certificate, else user@host")
+    ] = "",
     takeover: Annotated[bool, typer.Option("--takeover", help="take the robot from whoever drives it")] = False,
     connect: Connect = [],
     tls: TlsFolder = None,
@@ -206,7 +208,10 @@ def unlatch(
 def restart(
     robot: Annotated[str, typer.Argument(help="the robot's name", show_default=False)] = "",
     everything: Annotated[bool, typer.Option("--all", help="every robot of the realm")] = False,
-    who: Annotated[str, typer.Option(help="the name of your certificate; user@host by default")] = "",
+    who: Annotated[
+        str,
+        typer.Option(help="name under which the router knows you; by default that in the certificate, else user@host"),
+    ] = "",
     connect: Connect = [],
     tls: TlsFolder = None,
     realm: Realm = "fleet",

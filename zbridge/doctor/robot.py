@@ -270,11 +270,11 @@ REMEDIES: dict[str, str] = {
     Code.NEUTRAL_FIRST: "centre the joystick, or call drive.neutral(), before moving again",
     Code.LATCHED: "a latched stop is in force: zbridge unlatch once it is safe",
     Code.STALE: "the network delays commands by more than max_age_s: look at the driver's network",
-    Code.NOT_READY: "the robot accepts no commands now: see the layer robot",
+    Code.NOT_READY: "the robot accepts no commands now: status says why",
     Code.BUSY: "the robot is busy: wait",
     Code.CLOSING: "its gateway is ending: wait for the next one",
     Code.UNSUPPORTED: "this robot cannot do it, or it is switched off in its options",
-    Code.MALFORMED: "the program sends what cannot be read: compare it with docs/reference/keys.md",
+    Code.MALFORMED: "the program sends what cannot be decoded: compare it with docs/reference/messages.md",
     Code.OUT_OF_ORDER: "the program repeats numbers, or two programs use one lease",
     Code.RATE: "the program sends too fast",
 }

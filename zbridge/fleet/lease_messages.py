@@ -58,9 +58,9 @@ class Lease(FleetMessage, frozen=True):
     """The answer to every query about the lease.
 
     ok: whether it is granted. lease: its public id. token: secret, for the holder, never sent again; both only where
-    the lease is granted. expires_in_s: unless it is renewed. holder: who has it. reason: of a refusal, for people.
-    code: a :class:`zbridge.errors.Code` where it is refused, for programs. max_age_s: what is later than that is stale;
-    where it is given, commands and renewals must be dated.
+    the lease is granted. expires_in_s: until the lease ends, unless it is renewed. holder: who has it. reason: of a
+    refusal, for people. code: a :class:`zbridge.errors.Code` where it is refused, for programs. max_age_s: what is
+    later than that is stale; where it is given, commands and renewals must be dated.
     """
 
     ok: bool

@@ -56,7 +56,7 @@ class Scanner(FleetMessage, frozen=True):
     """The geometry of a laser scanner.
 
     angle_min, angle_max, angle_increment: radians. time_increment_s: from one point to the next. range_min, range_max:
-    metres. points: of a sweep.
+    metres. points: in one sweep.
     """
 
     angle_min: float
@@ -94,8 +94,8 @@ class Pose(FleetMessage, frozen=True):
 class Map(FleetMessage, frozen=True, eq=False):
     """An occupancy map.
 
-    rows, columns: of cells. cell: side of a cell in metres. origin: [x, y] of cell (0, 0) in metres. cells: uint8[rows,
-    columns], row = y, 0 unknown, 1 free, 2 occupied.
+    rows, columns: number of them. cell: side of a cell in metres. origin: [x, y] of cell (0, 0) in metres. cells:
+    uint8[rows, columns], row = y, 0 unknown, 1 free, 2 occupied.
     """
 
     rows: int
@@ -198,8 +198,9 @@ class Raw(FleetMessage, frozen=True):
 class LinkStatus(msgspec.Struct, frozen=True):
     """One transport connection to the robot.
 
-    name: of the link, ``robot``. state: as of the robot. peer: its address. reason: why it is not established. shared:
-    gateways of other robots may connect to the same address; left out where they may not.
+    name: of the link, ``robot``. state: of the link, with the values of ``Status.state``. peer: its address. reason:
+    why it is not established. shared: gateways of other robots may connect to the same address; left out where they may
+    not.
     """
 
     name: str
@@ -215,10 +216,10 @@ RobotState = Literal["offline", "connecting", "handshaking", "established", "clo
 class Status(FleetMessage, frozen=True):
     """Whether the robot can be used, and what was negotiated with it.
 
-    state: of the robot. reason: why it is not established, or what is wrong with it. protocol, dialect, version: that
-    it speaks. features: that both sides use. links: to the robot. host: the machine of its gateway. stalled: True while
-    the robot's link acknowledges nothing: what it is sent waits. commands: what the robot accepts now: ``stop``,
-    ``drive``, ``light``, ``motor``; whoever holds the robot or not.
+    state: of the robot. reason: why it is not established, or what is wrong with it. protocol, dialect, version: of the
+    robot. features: features that both sides use. links: links to the robot. host: the machine of its gateway. stalled:
+    True while the robot's link acknowledges nothing: what it is sent waits. commands: what the robot accepts now:
+    ``stop``, ``drive``, ``light``, ``motor``; whoever holds the robot or not.
     """
 
     state: RobotState
@@ -270,9 +271,9 @@ class Latch(msgspec.Struct, frozen=True):
 class Control(FleetMessage, frozen=True):
     """Who drives, and what was refused lately.
 
-    state: of the lease. holder: the name of who has it. lease: the public id of the current lease. priority: that it
-    was asked for with. expires_in_s: unless it is renewed. refusals: the last different ones, newest last. latches: the
-    latched stops in force. stops: the ids of the last stops that had one.
+    state: of the lease. holder: the name of who has it. lease: the public id of the current lease. priority: of the
+    lease. expires_in_s: until the lease ends, unless it is renewed. refusals: the last different ones, newest last.
+    latches: the latched stops in force. stops: the ids of the last stops that had one.
     """
 
     state: Literal["free", "held", "stopped", "latched"]

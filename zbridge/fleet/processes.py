@@ -22,10 +22,10 @@ class Membership(FleetMessage, frozen=True):
 class SessionEntry(msgspec.Struct, frozen=True):
     """One session of the table, with a robot's link or with an HQ program.
 
-    name: of the session. peer: its address. role: ours, ``hq`` towards a robot, ``robot`` towards an HQ program. state:
-    of the session. reason: why it ended, or is not established. version: of the protocol. features: that both sides
-    use. transport: of its frames. counters: frames and bytes carried, lost and refused. left_out: counts of what has no
-    form on the other side.
+    name: of the session. peer: its address. role: of the gateway or listener, ``hq`` towards a robot, ``robot`` towards
+    an HQ program. state: of the session. reason: why it ended, or is not established. version: of the protocol.
+    features: features that both sides use. transport: of its frames. counters: frames and bytes carried, lost and
+    refused. left_out: counts of what has no form on the other side.
     """
 
     name: str
@@ -92,8 +92,8 @@ class Stats(FleetMessage, frozen=True):
 
     process: that it runs in. rates: messages that it published in the last second, by the first part of the key:
     ``{"pose": 20.0}``. gaps: messages of the robot that were lost before they reached the gateway, where a sequence
-    shows it, since the process started. refused: commands, since then. dropped: messages, since then. listeners: of the
-    process. disks: that it writes to.
+    shows it, since the process started. refused: commands refused since then. dropped: messages dropped since then.
+    listeners: of the process. disks: that it writes to.
     """
 
     process: ProcessStats

@@ -31,11 +31,11 @@ class ListenerTls(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class HqSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One ``[[hq]]``: where HQ programs of one protocol connect as if this were the robot, and their limits.
 
-    protocol: of the HQ programs. listen: ``tcp://host:port`` or ``tls://host:port``. name: of the listener on the bus;
-    None: made of the protocol and the process. clients: most at a time. accept_hz: connections a second that are
-    accepted from one address. handshake_s: longest time for a client's handshake. idle_s: longest silence of a client;
-    None: no limit. rate_hz: messages a second of one client. allow: networks that clients may connect from; empty: all.
-    tls: what is shown to clients, at an address ``tls://host:port``.
+    protocol: the protocol of the HQ programs. listen: ``tcp://host:port`` or ``tls://host:port``. name: of the listener
+    on the bus; absent: made of the protocol and the process. clients: most at a time. accept_hz: connections a second
+    that are accepted from one address. handshake_s: longest time for a client's handshake. idle_s: longest silence of a
+    client; absent: no limit. rate_hz: messages a second of one client. allow: networks that clients may connect from;
+    empty: all. tls: the listener's certificate, at an address ``tls://host:port``.
     """
 
     protocol: str

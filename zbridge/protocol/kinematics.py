@@ -28,8 +28,8 @@ def within_full_scale(forward: float, left: float, turn: float) -> Drive:
 class Differential(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Two sides of wheels.
 
-    track_m: between the sides. speed_full_m_s: over ground at ``forward`` = 1. turn_full_rad_s: yaw rate at
-    ``turn`` = 1.
+    track_m: distance between the left and the right wheels. speed_full_m_s: over ground at ``forward`` = 1.
+    turn_full_rad_s: yaw rate at ``turn`` = 1.
     """
 
     track_m: Positive
@@ -57,7 +57,7 @@ class Differential(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 class Factors(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What each part of a drive adds to the value of one motor.
 
-    forward, left, turn: at 1, in the motor's unit.
+    forward, left, turn: value added when this part of the drive is 1, in the motor's unit.
     """
 
     forward: Factor = 0.0

@@ -15,7 +15,7 @@ from zbridge.protocol.plugin import Protocol, RobotSide
 class DeviceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[device]``: the robot itself.
 
-    protocol: that it speaks. connect: one address for each of its links, ``tcp://host:port`` or
+    protocol: the robot's protocol. connect: one address for each of its links, ``tcp://host:port`` or
     ``serial:///dev/ttyUSB0?baud=57600``. allow_shared_address: gateways of other robot names may connect to the same
     address; both must say so.
     """

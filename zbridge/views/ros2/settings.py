@@ -34,7 +34,7 @@ class RobotBody(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What ROS has to know of a robot, and robots do not report.
 
     speed_full_mps, turn_full_radps: its speeds at full scale. wheelbase_m: of a robot that steers, between its axles;
-    None: it turns on the spot. steer_full_rad: how far its wheels turn at full lock; an ALF vehicle gets 90 degrees
+    absent: it turns on the spot. steer_full_rad: how far its wheels turn at full lock; an ALF vehicle gets 90 degrees
     then. length_m, width_m, height_m: what RViz shows. laser: where the scanner is. sensors: where those of these
     names are, and the ``camera``; of others no frame is told. map_to_odom: tell ROS that odometry begins at the map's
     origin; false where a program of ROS's, as slam_toolbox, tells it.
@@ -55,10 +55,10 @@ class RobotBody(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Ros2Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The file, TOML; options win over it.
 
-    domain: ROS_DOMAIN_ID. distro: of ROS. ros: ROS's routers, never the fleet's; empty: the one on this machine.
-    robots: those that are shown, empty for all. drive: let publishers drive. realm: the first chunk of all keys. bus:
-    the fleet's, as in a robot's file. others: of robots that have no table of their own below ``robot``. robot: tables
-    of single robots.
+    domain: ROS_DOMAIN_ID. distro: distribution of ROS 2. ros: ROS's routers, never the fleet's; empty: the one on this
+    machine. robots: those that are shown, empty for all. drive: let publishers drive. realm: the first chunk of all
+    keys. bus: the fleet's, as in a robot's file. others: of robots that have no table of their own below ``robot``.
+    robot: tables of single robots.
     """
 
     domain: int = 0

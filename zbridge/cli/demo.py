@@ -112,6 +112,7 @@ async def run_demo(seconds: float, *, secure: bool = False, console: bool = Fals
     if console and not _has_console():
         raise ConfigError("--console: install the extra: pip install 'zbridge[console]'")
     robots = {f"{name}1": name for name in protocol_names() if _is_whole(name)}
+    print(f"starting {', '.join(robots)}", flush=True)  # noqa: T201 - the first words of the rest take seconds
     watch = LiveTable(list(robots))
     async with contextlib.AsyncExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="zbridge-demo-")))

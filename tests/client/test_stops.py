@@ -50,7 +50,7 @@ async def test_the_fleet_is_latched_by_one_id_and_released_everywhere() -> None:
     assert await world.fleet.latch(reason="fire") == dict.fromkeys(("r1", "r2", "r3"))
     ids = {latch.id for gateway in world.gateways.values() for latch in gateway.control.latches if latch.fleet}
     assert len(ids) == 1
-    with pytest.raises(Unsupported, match="belongs to the whole fleet: release it with unlatch_fleet"):
+    with pytest.raises(Unsupported, match="belongs to the whole fleet: release it with zbridge unlatch --all"):
         await world.fleet["r1"].unlatch()
     assert await world.fleet.unlatch() == dict.fromkeys(("r1", "r2", "r3"))
     assert [world.gateways[name].control.state for name in ("r1", "r2", "r3")] == ["stopped", "latched", "stopped"]

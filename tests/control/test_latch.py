@@ -79,9 +79,9 @@ def test_a_release_is_of_the_robot_or_of_the_fleet_and_of_a_known_id() -> None:
     latches = Latches()
     latches.add(latch(1))
     latches.add(latch(2, fleet=True))
-    with pytest.raises(Unsupported, match="belongs to the whole fleet: release it with unlatch_fleet"):
+    with pytest.raises(Unsupported, match="belongs to the whole fleet: release it with zbridge unlatch --all"):
         latches.release(stop_id(2), fleet=False)
-    with pytest.raises(Unsupported, match=r"belongs to this robot alone: release it with unlatch$"):
+    with pytest.raises(Unsupported, match=r"belongs to this robot alone: release it with zbridge unlatch ROBOT$"):
         latches.release(stop_id(1), fleet=True)
     with pytest.raises(Malformed):
         latches.release(stop_id(3), fleet=False)

@@ -118,7 +118,9 @@ def renew(
         raise ConfigError("name one NAME or more, or give --all")
     for name in names or load_roles(folder.roles).names:
         print_issued(folder, name, authority.renew(folder, name, now(), days=days))
-    say("The key stays: carry the new certificate.pem and ca.pem to where the old ones are used, and restart there.")
+    say(
+        "The key stays: copy certificate.pem to where the old one is used, ca.pem too if the authority is new; restart."
+    )
 
 
 @app.command("list")

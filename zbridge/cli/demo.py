@@ -14,7 +14,7 @@ import sys
 import tempfile
 import webbrowser
 from collections import Counter
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from typing import IO
@@ -129,12 +129,7 @@ async def run_demo(seconds: float, *, secure: bool = False, console: bool = Fals
                 del watch.rows[robot]
         for key_expr in ("*", "sensor/*"):
             bus.viewer.subscribe(f"{REALM}/*/{key_expr}", watch.take)
-        how = [
-            f"router at {bus.endpoint}; try, in another terminal:",
-            *(f"  {line}" for line in bus.commands),
-            "HQ programs connect to the robots here; to simulate one:",
-            *(f"  {name}: {_how_to_connect(find_protocol(robots[name]), listeners[name])}" for name in watch.rows),
-        ]
+        how = _how_to_use(bus, {name: (find_protocol(robots[name]), listeners[name]) for name in watch.rows})
         if _has_console():
             serving = _console(folder, log, bus.joins, secure=secure, opens=console)
             how.append(f"the fleet in a browser, with STOP ALL: {await stack.enter_async_context(serving)}")
@@ -202,6 +197,16 @@ def _is_whole(name: str) -> bool:
     except ConfigError as error:
         _left_out(error)
     return False
+
+
+def _how_to_use(bus: DemoBus, robots: Mapping[str, tuple[Protocol, str]]) -> list[str]:
+    """Return what to try. robots: each with its protocol, and the address of its listener for HQ programs."""
+    return [
+        f"router at {bus.endpoint}; try, in another terminal:",
+        *(f"  {line}" for line in bus.commands),
+        "HQ programs connect to the robots here; to simulate one:",
+        *(f"  {name}: {_how_to_connect(*each)}" for name, each in robots.items()),
+    ]
 
 
 def _how_to_connect(protocol: Protocol, listener: str) -> str:

@@ -159,7 +159,8 @@ class Latches:
         latch = self._in_force.get(stop_id)
         if latch is not None and latch.fleet is not fleet:
             whose = "the whole fleet" if latch.fleet else "this robot alone"
-            raise Unsupported(f"this latched stop belongs to {whose}: release it with unlatch{'_fleet' * latch.fleet}")
+            how = "zbridge unlatch --all" if latch.fleet else "zbridge unlatch ROBOT"
+            raise Unsupported(f"this latched stop belongs to {whose}: release it with {how}")
         released = self._released_fleet if fleet else self._released
         if latch is None and not fleet and stop_id not in released:
             raise Malformed("no latched stop has this id", Code.MALFORMED)

@@ -274,7 +274,7 @@ REMEDIES: dict[str, str] = {
     Code.BUSY: "the robot is busy: wait",
     Code.CLOSING: "its gateway is ending: wait for the next one",
     Code.UNSUPPORTED: "this robot cannot do it, or it is switched off in its options",
-    Code.MALFORMED: "the program sends what cannot be decoded: compare it with docs/reference/messages.md",
+    Code.MALFORMED: "the program sends what cannot be decoded: compare it with the reference of messages",
     Code.OUT_OF_ORDER: "the program repeats numbers, or two programs use one lease",
     Code.RATE: "the program sends too fast",
 }

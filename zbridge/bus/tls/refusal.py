@@ -175,8 +175,8 @@ _DISTRUST = {
     20: _ANOTHER,
     21: _ANOTHER,
     26: "is not one of a server: it was issued without --host",
-    62: "does not name the host {host}: issue it with --host {host}, or connect to a host that it names",
-    64: "does not name the host {host}: issue it with --host {host}, or connect to a host that it names",
+    62: "does not name the host {host}: issue it with --host {host} too, or connect to a host that it names",
+    64: "does not name the host {host}: issue it with --host {host} too, or connect to a host that it names",
 }
 """By OpenSSL's codes."""
 _REFUSALS = (

@@ -1,6 +1,7 @@
 """ALF towards HQ programs: what they are shown of any robot, and what they command. Sans-IO.
 
-Source: "The gateway as vehicle", "Translation" and the dialects of the protocol page.
+Source: "Towards HQ programs", "Translation from the robot", "Translation of commands" and "Versions and dialects" of
+the protocol page.
 """
 
 from __future__ import annotations
@@ -220,7 +221,8 @@ class AlfHq(HqSide):
         if not self._drive:
             session.left_out["drive command"] += 1
             return ()
-        if self._auto and not session.drive:  # no legacy program can read both kinds ("The gateway as vehicle")
+        # No legacy program can read both kinds ("What crashes a peer" in ``fragile-robots.md``).
+        if self._auto and not session.drive:
             session.show_drive()
         straight = FULL_LOCK_DEG if self._dialect is messages.AlfDialect.BINARY else 0
         right = max(-1.0, min(1.0, (message.steering - straight) / FULL_LOCK_DEG))

@@ -1,7 +1,7 @@
 """The five messages of ALF, each declared once for both dialects, and their framing.
 
-Source: the message table, "Dialect `binary`" and "Dialect `text`" of the protocol page. A field's type is its
-binary form; a comment marks a field whose text form differs. Sans-IO.
+Source: "Versions and dialects" of the protocol page. A field's type is its binary form; a comment marks a field whose
+text form differs. Sans-IO.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Sessions of ALF in both roles and dialects: framing, END, and the drive command that repeats for ever. Sans-IO.
 
-Source: "Roles", "The gateway as HQ" and the dialects of the protocol page. There is no handshake: a session
-is established at once.
+Source: "Links", "Handshake", "Translation of commands" and "Versions and dialects" of the protocol page. There is no
+handshake: a session is established at once.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """An ALF vehicle to play with: steers like a car, measures the room with its laser, stops when nobody drives it.
 
 It speaks either dialect, on one port or two. Deterministic with a seed: the same commands at the same times give
-the same world. Source: the message table and "Dialect `text`" of the protocol page.
+the same world. Source: "Versions and dialects" and "Translation of commands" of the protocol page.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ LOCK_RAD = math.radians(30.0)
 """Steering angle at full lock."""
 ACCELERATION_M_S2 = 2.0
 SILENT_S = 2.0
-"""Seconds without a drive command after which the motor stops: 20 cycles of 20 ticks at 200 Hz ("Dialect `text`")."""
+"""Seconds without a command until the motor stops: 20 cycles of 20 ticks at 200 Hz ("Translation of commands")."""
 SCANNER = ScannerInit(-135.0, 119.882812, 0.351562, 100, 20, 5600)
 POINTS, FIRST_VALID, LAST_VALID = 769, 44, 725
 NOISE_MM = 5.0
@@ -105,7 +105,7 @@ class Car:
 
 
 class VehicleSimulator(Simulator[AlfMessage]):
-    """Serves one car: on one link, or drive commands on the first and measurements on the second ("Roles")."""
+    """Serves one car: on one link, or drive commands on the first and measurements on the second ("Links")."""
 
     def __init__(self, seed: int, dialect: AlfDialect, links: int) -> None:
         super().__init__(log, links=(DRIVE, LASER) if links > 1 else (VEHICLE,))

@@ -1,6 +1,6 @@
 """Translates between ALF messages and fleet messages, both ways: one vehicle. Sans-IO.
 
-Source: "Translation" and "The gateway as HQ" of the protocol page.
+Source: "Translation from the robot" and "Translation of commands" of the protocol page.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What TCP/UDP robots are known to suffer from, for ``zbridge doctor``: the reasons that sessions give, and remedies.
 
-Source: "One usable connection per start" and "Settings and version negotiation" of the protocol page.
+Source: "Signs of a poor connection" and "Versions and dialects" of the protocol page.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """One listener for HQ programs of TCP/UDP: its clients, its answers, and what it shows them of any robot. Sans-IO.
 
 Every packet is encoded once for all clients. The session of a client and its commands are in :mod:`.hq_client`.
-Source: "The gateway as robot", "Translation" and "Settings and version negotiation" of the protocol page.
+Source: "Towards HQ programs", "Translation from the robot" and "Versions and dialects" of the protocol page.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """One TCP/UDP HQ program: its session, how frames are queued for it, and its packets as fleet commands. Sans-IO.
 
-Source: "The gateway as robot" and "Translation" of the protocol page. Packets that no fleet message holds become raw
-commands.
+Source: "Towards HQ programs" and "Translation of commands" of the protocol page. Packets that no fleet message holds
+become raw commands.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from zbridge.fleet.messages import Drive, Mode, Query, Raw, Scan, Switch, Text
 from zbridge.protocol import Datagram, EncodeError, Limits, ProtocolError, Send, Telemetry
 
 _ASKING = ("1.1",)
-"""Versions whose first programs have no handlers for packets that they did not ask for ("The gateway as robot")."""
+"""Versions whose first programs need to have asked for a packet ("What crashes a peer" in ``fragile-robots.md``)."""
 _ON_REQUEST = frozenset({packets.ServerSLAMMap.spec.id, packets.ServerPosition.spec.id})
 
 

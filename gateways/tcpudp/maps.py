@@ -1,6 +1,6 @@
 """Resamples maps to what HQ programs can read: square, of the announced size, short enough for one packet. Sans-IO.
 
-Source: "Packets" (map bytes) and "The gateway as robot" of the protocol page.
+Source: "Translation from the robot" (map bytes) and "Towards HQ programs" of the protocol page.
 """
 
 from __future__ import annotations

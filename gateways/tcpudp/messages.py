@@ -1,7 +1,6 @@
 """The packets of the TCP/UDP package protocol, each declared once, and how they are framed.
 
-Source: the packet table and "Framing" of the protocol page. Names are the protocol's own, spelling included.
-Sans-IO.
+Source: "Versions and dialects" of the protocol page. Names are the protocol's own, spelling included. Sans-IO.
 """
 
 from __future__ import annotations
@@ -215,8 +214,8 @@ class ClientGetSLAMMap(Packet, frozen=True):
 class ServerSLAMMap(Packet, frozen=True):
     """The map: 0 unknown, 1 free, 2 obstacle, index = x * side + y. Empty: no map yet.
 
-    The count is always written: an HQ program that gets a 53 without it throws for good ("Packets"). Robots may leave
-    it out.
+    The count is always written: an HQ program that gets a 53 without it throws for good
+    ("What crashes a peer" in ``fragile-robots.md``). Robots may leave it out.
     """
 
     cells: Blob = b""
@@ -276,7 +275,7 @@ class OpaquePacket(Packet, frozen=True):
 
 
 def frame_end(data: bytes, start: int) -> int:
-    """Find where the packet at ``start`` ends ("Framing"): ``int32 length | u8 id | u8 packet id | body``."""
+    """Find where a packet ends ("Versions and dialects"): ``int32 length | u8 id | u8 packet id | body``."""
     if len(data) - start < _HEADER_SIZE:
         return start + _HEADER_SIZE
     length: int = _LENGTH(data, start)[0]
@@ -323,7 +322,7 @@ def decoder(packet_id: int) -> Callable[[bytes, int], Packet]:
 
 
 def _decode_text(frame: bytes, start: int) -> Packet:
-    """Read packet 1; one that is broadcast carries a second header before the first ("The gateway as HQ")."""
+    """Read packet 1; a broadcast one carries a second header first ("Decisions where the document is silent")."""
     while _is_whole_text(frame, start):
         start += HEADER.size
     return DebugMessage.spec.codec.decode(frame, start)
@@ -341,9 +340,9 @@ def _is_whole_text(frame: bytes, start: int) -> bool:
 
 
 def _decode_map(frame: bytes, start: int) -> Packet:
-    """Read packet 53; some robots answer 54 with it and three floats: a position ("The gateway as HQ").
+    """Read packet 53; some robots answer 54 with it and three floats: a position ("Translation from the robot").
 
-    One without a body is a map of no cells ("Packets").
+    One without a body is a map of no cells ("Decisions where the document is silent").
     """
     if start == len(frame):
         return ServerSLAMMap()

@@ -1,7 +1,7 @@
 """The settings blocks of each version, declared flag by flag, and the version table: what peers send and know. Sans-IO.
 
-Source: "Settings and version negotiation" and "The gateway as robot" of the protocol page. A block is that of the
-newest version its sender lists; older readers ignore the tail.
+Source: "Versions and dialects" of the protocol page, "What crashes a peer" in ``fragile-robots.md``. A block is that
+of the newest version its sender lists; older readers ignore the tail.
 """
 
 from __future__ import annotations

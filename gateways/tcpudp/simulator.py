@@ -1,7 +1,7 @@
 """A robot of the TCP/UDP package protocol to play with: moves, measures walls, builds a map, answers every packet.
 
 It speaks any version, with or without UDP. Deterministic with a seed: the same packets at the same times give the
-same world. Source: the packet table and "Translation" of the protocol page.
+same world. Source: "Versions and dialects" and "Translation from the robot" of the protocol page.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _DEGREES = np.radians(np.arange(360.0))
 _POSE_EVERY, _MAP_EVERY, _ASK_EVERY = 5, 50, 50
 CLIENTS = range(2, 256)
 QUIET_S = 2.0
-"""Seconds before a client id is given again ("The gateway as robot")."""
+"""Seconds before a client id is given again ("Limits of a listener" in ``translation.md``)."""
 PARTS = 4
 """Packets in which a robot of version "1.4" sends its map, one a second, again and again; legacy ones make 4096."""
 

@@ -1,7 +1,7 @@
 """Packets of a robot to fleet messages, with all units and axes. Sans-IO.
 
-Source: "Translation" and "The gateway as HQ" of the protocol page. The robot's axes are x right and y forward, lengths
-in its own unit (centimetres), headings in degrees; the fleet's are those of REP 103.
+Source: "Translation from the robot" and "Limits" (a map in parts) of the protocol page. The robot's axes are x right
+and y forward, lengths in its own unit (centimetres), headings in degrees; the fleet's are those of REP 103.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class TelemetryTranslator(Kept):
 
     @property
     def sends_parts(self) -> bool:
-        """True if the robot sends its map in parts: its handler of 52 is empty ("The gateway as HQ")."""
+        """True if the robot sends its map in parts: its handler of 52 is empty ("Limits")."""
         return self._parts_from is not None and self._session is not None and self._parts_from == self._session.version
 
     def await_map(self) -> None:

@@ -1,7 +1,7 @@
 """One robot of the TCP/UDP package protocol, seen from its HQ: commands to packets, and its stop. Sans-IO.
 
-Source: "Translation", "Packets" (61) and "The gateway as HQ" of the protocol page. Telemetry is translated by
-:mod:`.telemetry`.
+Source: "Translation of commands", "Versions and dialects" (61) and "Limits" of the protocol page. Telemetry is
+translated by :mod:`.telemetry`.
 
 Theory of operation of the stop. One slot of the outbox holds what is repeated: the packets of the last drive, or packet
 13. Packet 13 does not end mode 3, and no packet acknowledges a mode: a robot that stalls drops what piled up, another

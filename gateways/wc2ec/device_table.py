@@ -2,7 +2,7 @@
 
 Each device keeps its name and number while any controller knows it: controllers learn each number once. Only when no
 number is left, devices that the robot has no longer and that no controller knows give theirs up.
-Source: "The gateway as Webots controller" of the protocol page.
+Source: "Towards HQ programs" and "Limits" of the protocol page.
 """
 
 from __future__ import annotations

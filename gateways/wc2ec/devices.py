@@ -1,6 +1,6 @@
 """The devices of one Webots robot: what is registered or configured, under which names. Sans-IO.
 
-Source: the dialects of the protocol page; names in keys are the design's.
+Source: "Versions and dialects" and "Translation from the robot" (names in keys) of the protocol page.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """One listener for external controllers: its clients, and what it shows them of any robot. Sans-IO.
 
 It shows device registrations and sensor values, each encoded once for all clients. The session of a client and its
-commands are in :mod:`.hq_client`, its devices in :mod:`.device_table`. Source: "The gateway as Webots controller" and
-the dialects of the protocol page.
+commands are in :mod:`.hq_client`, its devices in :mod:`.device_table`. Source: "Towards HQ programs" and
+"Versions and dialects" of the protocol page.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from zbridge.protocol import ATTEND_S, HqSide, Limits, Metrics, ProtocolError, R
 DEADMAN_S = 0.5
 FAULT = -1.0
 """What a distance sensor shows when nothing is known: legacy controllers take it as a fault, while anything from
-0 to 1000 would be a false distance ("The gateway as Webots controller")."""
+0 to 1000 would be a false distance ("What crashes a peer" in ``fragile-robots.md``)."""
 
 
 class Wc2EcHq(HqSide):

@@ -1,7 +1,7 @@
 """One external controller: its session, and its messages as fleet commands. Sans-IO.
 
 A robot without motors is shown two, ``left`` and ``right``. Legacy controllers set them one after the other: what is
-set within ``join_s`` becomes one drive; a stop never waits. Source: "The gateway as Webots controller".
+set within ``join_s`` becomes one drive; a stop never waits. Source: "Towards HQ programs" of the protocol page.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The messages of WC2EC, each declared once for all dialects that have it, and their framing.
 
-Source: "Dialect `draft`" and "Dialect `deployed`" of the protocol page. Every message begins with a byte of command,
-one of sensor type and one of sensor number; the command determines the rest. Sans-IO.
+Source: "Versions and dialects" of the protocol page. Every message begins with a byte of command, one of sensor type
+and one of sensor number; the command determines the rest. Sans-IO.
 """
 
 from __future__ import annotations

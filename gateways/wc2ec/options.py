@@ -1,7 +1,8 @@
 """Options of WC2EC in a configuration: of a robot, and of a listener for external controllers. Sans-IO.
 
-A robot's options name its devices, the meaning of their values, and its kinematics. Source: the dialects of the
-protocol page; the templates of ``zbridge init`` explain each option.
+A robot's options name its devices, the meaning of their values, and its kinematics. Source: "Versions and dialects",
+"Translation from the robot" and "Translation of commands" of the protocol page; the templates of ``zbridge init``
+explain each option.
 """
 
 from __future__ import annotations

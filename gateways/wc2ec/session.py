@@ -1,7 +1,7 @@
 """Sessions of WC2EC in both roles and both dialects. Sans-IO.
 
-Source: "Roles" and the dialects of the protocol page. The Webots controller of the field registers its devices first:
-that is the handshake. The draft has none.
+Source: "Links", "Handshake" and "Versions and dialects" of the protocol page. The Webots controller of the field
+registers its devices first: that is the handshake. The draft has none.
 """
 
 from __future__ import annotations

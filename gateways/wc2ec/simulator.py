@@ -1,7 +1,7 @@
 """A simulated Webots robot, in either dialect: two wheels, a lift, a ring of distance sensors, or light sensors.
 
-Deterministic with a seed: the same commands at the same times give the same world. Source: the dialects of the protocol
-page.
+Deterministic with a seed: the same commands at the same times give the same world.
+Source: "Versions and dialects" of the protocol page.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Translates between WC2EC messages and fleet messages, both ways: one Webots robot. Sans-IO.
 
-Source: the dialects and "The gateway as external controller" of the protocol page.
+Source: "Versions and dialects", "Translation from the robot" and "Translation of commands" of the protocol page.
 """
 
 from __future__ import annotations

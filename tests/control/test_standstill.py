@@ -12,7 +12,7 @@ from tests.robot.test_device import NEUTRAL, Rig, established, serving
 pytestmark = pytest.mark.jumping
 
 STOP = bytes.fromhex("02000000 02 0d")
-"""Packet 13 to client id 2 (tcpudp.md, "Framing"): length 2, id, packet id."""
+"""Packet 13 to client id 2 ("Versions and dialects" in ``tcpudp.md``): length 2, id, packet id."""
 MODE_NONE = bytes.fromhex("06000000 02 0a 01000000")
 MODE_MANUAL = bytes.fromhex("06000000 02 0a 02000000")
 FORWARD = {"forward": 1.0}
@@ -93,7 +93,7 @@ SETTINGS = {
         ("1.3", b"1.1,1.2,1.3", bytes.fromhex("00010101010101 e8030000 0a000000")),
     )
 }
-"""serverSettings with Joystick of robots of three versions (tcpudp.md, "Settings and version negotiation")."""
+"""serverSettings with Joystick of robots of three versions ("Versions and dialects" in ``tcpudp.md``)."""
 
 
 @pytest.mark.parametrize(("version", "apart_s"), [("1.1", 0.25), ("1.2", 0.25), ("1.3", 1.0)])

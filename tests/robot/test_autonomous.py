@@ -1,6 +1,6 @@
 """A robot that is told to move by itself: that is written down before, and whoever serves it next stops it for good.
 
-``scene`` explains the scripts. Expected bytes: the protocol page, "Stops after mode 3".
+``scene`` explains the scripts. Expected bytes: "Stops after mode 3" in ``tcpudp.md``.
 """
 
 from __future__ import annotations

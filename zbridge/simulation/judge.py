@@ -2,8 +2,8 @@
 
 A judge is a simulated peer as fragile as the legacy ones: it records each violation of what the page of its protocol
 demands, and dies of what kills or cripples the legacy programs. Section names in its docstrings are those of that
-page. Judges share their scaffold (this module, ``fragile``, ``hq_program``, ``sockets`` and ``timing``), and no code
-with the gateway that they judge, so that an error there cannot hide here.
+page, or of the page that they name. Judges share their scaffold (this module, ``fragile``, ``hq_program``, ``sockets``
+and ``timing``), and no code with the gateway that they judge, so that an error there cannot hide here.
 """
 
 from __future__ import annotations

@@ -29,9 +29,9 @@ from zbridge.simulation.judge import Ended
 from zbridge.simulation.timing import Ticker
 
 Serves = Literal["auto", "drive", "laser", "both"]
-"""What the gateway's listener is configured to serve ("The gateway as vehicle")."""
+"""What the gateway's listener is configured to serve ("Towards HQ programs")."""
 Deployed = Literal["driving", "scanning"]
-"""Which of the legacy programs; none tolerates both kinds of messages ("The gateway as vehicle")."""
+"""Which legacy program; none tolerates both kinds of messages ("What crashes a peer" in ``fragile-robots.md``)."""
 
 _SERVED = {"drive": (INFO, END), "laser": (INIT, SCAN, END), "both": (INIT, SCAN, INFO, END)}
 _MOST_SCANS = 10
@@ -96,8 +96,9 @@ class FragileAlfHq(HqProgram):
         self.idle()
 
     def drive(self, speed: int, direction: int = 0, steering: int | None = None, light: bool = False) -> None:
-        """Repeat another command from now on ("Dialect ..." 3); ``steering``: as the dialect has it, None is straight.
+        """Repeat another command from now on ("Versions and dialects", 3).
 
+        ``steering``: as the dialect has it, None is straight.
         Raise ValueError for what no HQ program of the dialect sends.
         """
         left, right = wire.ANGLES[self.dialect]
@@ -157,7 +158,7 @@ class FragileAlfHq(HqProgram):
                     await self._read()
                 if self._broken:
                     self._judge_end(self._broken)
-                await asyncio.Event().wait()  # for good ("stops reading ... after ten measurements")
+                await asyncio.Event().wait()  # for good ("What crashes a peer" in ``fragile-robots.md``)
         except TimeoutError:
             self._judge_delay()
 
@@ -174,7 +175,7 @@ class FragileAlfHq(HqProgram):
         raise Ended("the HQ closed")
 
     def _judge_end(self, end: str) -> NoReturn:
-        """Judge an end of the connection ("HQ programs do not notice EOF: send END before closing")."""
+        """Judge an end of the connection ("Towards HQ programs": END is sent before every close)."""
         closing = self._phase is Phase.CLOSING
         self._phase = Phase.OVER
         if closing or self._stopped:
@@ -216,7 +217,7 @@ class FragileAlfHq(HqProgram):
         return _SERVED["laser" if since_s < 0 else "both" if since_s < self._flight_s else "drive"]
 
     def _show(self, message: ParsedAlfMessage) -> None:
-        """Take a message of the right length ("Send the cached 2 first, then 1 and 4 as they come")."""
+        """Take a message of the right length ("Towards HQ programs": 2 comes before any 1)."""
         if message.kind == INIT:
             if self.scanner is not None:
                 self._event("another scanner init")
@@ -243,7 +244,7 @@ class FragileAlfHq(HqProgram):
     # Messages of the HQ
 
     async def _repeat(self) -> None:
-        """Send the command every 20 ms even when unchanged ("Dialect `text`" 3)."""
+        """Send the command every 20 ms even when unchanged, as a gateway does ("Translation of commands")."""
         if self._repeat_s is None:
             return
         ticker = Ticker(self._repeat_s, first_s=0.0)

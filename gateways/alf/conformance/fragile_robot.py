@@ -59,7 +59,7 @@ class FragileVehicle(FragileServer):
         self._idle_s = self._waited_s = self._late_s = 0.0
 
     async def end(self) -> None:
-        """Send END, and wait for the end of the connection: END back within 1 s, then the close ("Roles")."""
+        """Send END, and wait for the end of the connection: END back within 1 s, then the close ("Links")."""
         async with self._sending:
             if self._phase is Phase.CONNECTED:
                 self._phase, self._waited_s = Phase.ENDING, 0.0
@@ -112,7 +112,7 @@ class FragileVehicle(FragileServer):
             self._move(min(ticker.passed_s, _MOST_MOVE_S))
 
     def _judge_end(self, end: str) -> None:
-        """Judge an end of the connection ("Roles", END: both sides then close)."""
+        """Judge an end of the connection ("Links": END is answered, and the link closed)."""
         if self._phase is not Phase.CLOSING and self._reader.rest:
             self._violate(f"the connection ended within a message: {show(self._reader.rest, self.dialect)}")
         if self._phase is Phase.ENDING:
@@ -152,7 +152,7 @@ class FragileVehicle(FragileServer):
         return None
 
     def _obey(self, message: ParsedAlfMessage) -> None:
-        """Take a command; apply the last one again on any message ("The gateway as HQ": stale commands)."""
+        """Take a command; apply the last one again on any message ("Translation of commands")."""
         if message.kind == wire.DRIVE and self._reader.whole(message):
             speed = message.fields[0]
             if self._command is None and speed:
@@ -187,7 +187,7 @@ class FragileVehicle(FragileServer):
         self._shut(socket.SHUT_WR)
 
     def _move(self, dt: float) -> None:
-        """Move; stop the motor after some time without a command, connected or not ("Dialect `text`", 3)."""
+        """Move; stop the motor after some time without a command, connected or not ("Translation of commands")."""
         if not self.drive:
             return
         was_idle_s, self._idle_s = self._idle_s, self._idle_s + dt
@@ -200,7 +200,7 @@ class FragileVehicle(FragileServer):
     # Messages of the vehicle
 
     async def _measure(self) -> None:
-        """Send 2 once, then 1 ten times a second ("Dialect `text`")."""
+        """Send 2 once, then 1 ten times a second."""
         await self._send(wire.INIT)
         await self._repeat(wire.SCAN, Ticker(self._times.scan_s))
 
@@ -230,7 +230,7 @@ class FragileVehicle(FragileServer):
 
 
 def fragile_vehicle(dialect: Dialect, *, servers: int, seed: int, times: AlfTimes = _DEPLOYED) -> list[FragileVehicle]:
-    """Make the servers of one vehicle: one for everything, or one that drives and one that measures ("Roles")."""
+    """Make the servers of one vehicle: one for everything, or one that drives and one that measures ("Links")."""
     server = partial(FragileVehicle, dialect, seed=seed, times=times)
     drive = server(laser=servers == 1, drive=True)
     made = {"vehicle" if servers == 1 else "drive": drive}

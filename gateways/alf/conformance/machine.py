@@ -17,7 +17,7 @@ _FIRST_VALID, _LAST_VALID = 44, 725
 _FULL_M_S, _WHEELBASE_M, _WHEEL_RAD, _LAG_S = 1.0, 0.3, math.radians(30), 0.2
 _GRAVITY_M_S2 = 9.81
 _COUNTS_PER_G, _COUNTS_PER_DEG_S = 1000.0, 10.0
-"""Of message 4 in ``binary`` ("Scale of accelerations and gyro")."""
+"""Of message 4 in ``binary`` ("Translation from the robot")."""
 
 
 class JudgedVehicle:
@@ -38,7 +38,7 @@ class JudgedVehicle:
         return self._target_m_s != 0.0
 
     def obey(self, dialect: Dialect, fields: Sequence[float]) -> None:
-        """Take the fields of message 3 ("Dialect ..." 3: negative is left, 0 is full left)."""
+        """Take the fields of message 3 ("Translation of commands": to the right positive, binary adds 90)."""
         speed, direction, angle, light = fields
         speed = min(speed, FULL_PERCENT) if dialect == "binary" else speed
         low, high = ANGLES[dialect]
@@ -58,7 +58,7 @@ class JudgedVehicle:
         self.place.step(self._speed_m_s, 0.0, self._turn_rad_s, dt)
 
     def geometry(self) -> list[int | float]:
-        """Return the fields of message 2: degrees, ms, mm ("Dialect `text`" 2)."""
+        """Return the fields of message 2: degrees, ms, mm ("Versions and dialects", 2)."""
         angle_max = _ANGLE_MIN_DEG + self._valid[1] * _STEP_DEG
         return [_ANGLE_MIN_DEG, angle_max, _STEP_DEG, 100, *_RANGES_MM]
 
@@ -77,7 +77,7 @@ class JudgedVehicle:
         return [*points, first, last]
 
     def feel(self, dialect: Dialect) -> list[int | float]:
-        """Return the fields of message 4 ("Translation": lateral to the right, vertical towards the ground)."""
+        """Return the fields of 4 ("Translation from the robot": lateral to the right, vertical towards the ground)."""
         lateral_m_s2 = -self._speed_m_s * self._turn_rad_s
         accelerations_g = [self._gain_m_s2 / _GRAVITY_M_S2, lateral_m_s2 / _GRAVITY_M_S2, 1.0]
         gyro_deg_s = [0.0, 0.0, math.degrees(self._turn_rad_s)]

@@ -29,7 +29,7 @@ FULL_PERCENT = 100
 """Speed that is full speed; a vehicle takes more without clamping in ``text``, as 100 in ``binary``."""
 MAX_INT = 2**31 - 1
 NUMBER = re.compile(r"-?[0-9]*\.?[0-9]+")
-"""What legacy readers take as a field ("Dialect `text`")."""
+"""What legacy readers take as a field ("Versions and dialects")."""
 INTEGERS = re.compile(rb"(0|-?[1-9][0-9]*)(\|(0|-?[1-9][0-9]*))*;")
 """A message of integers, as std::to_string prints them."""
 
@@ -95,7 +95,7 @@ class ParsedAlfMessage(msgspec.Struct, frozen=True):
 
 
 def deadly(number: str) -> str:
-    """Return why std::stoi throws at a number, empty if it does not ("The gateway as vehicle")."""
+    """Return why std::stoi throws at a number, empty if it does not ("Limits": numbers)."""
     whole = number.split(".", maxsplit=1)[0]
     if whole in ("", "-"):
         return f"a number without leading digit, {number[:20]}"
@@ -157,11 +157,11 @@ class _AlfReader(MessageReader[ParsedAlfMessage]):
         return self._judge(kind, tuple(fields), raw)
 
     def _read_text(self, raw: bytes) -> ParsedAlfMessage:
-        """Read a message as legacy readers do: every number is a field, all else separates ("Dialect `text`")."""
+        """Read a message as legacy readers do: a number is a field, all else separates ("Versions and dialects")."""
         raise NotImplementedError
 
     def _judge(self, kind: int, fields: Fields, raw: bytes) -> ParsedAlfMessage:
-        """Judge a message by its fields ("The gateway as vehicle": what they break on; "Dialect ...")."""
+        """Judge a message by its fields ("Towards HQ programs", "Limits", "Versions and dialects")."""
         breaks = self._breaks(kind, fields)
         if breaks:
             problem = breaks
@@ -260,7 +260,7 @@ class VehicleReader(_AlfReader):
 
 
 class Repeats:
-    """The rhythm of the commands ("The gateway as HQ": repeats every 20 ms for as long as the link is up)."""
+    """The rhythm of the commands ("Translation of commands": repeats every 20 ms while the link is open)."""
 
     def __init__(self, times: AlfTimes) -> None:
         self._times, self._limit_s = times, times.first_s
@@ -297,11 +297,11 @@ def write(dialect: Dialect, kind: int, fields: Sequence[int | float]) -> bytes:
 
 
 def end(dialect: Dialect) -> bytes:
-    """Write END ("Dialect ..." 255)."""
+    """Write END ("Versions and dialects", 255)."""
     return write(dialect, END, [1])
 
 
 def _layout(kind: int, count: int) -> struct.Struct:
-    """Return the widths of a message in ``binary``; ``count``: of its fields ("Dialect `binary`")."""
+    """Return the widths of a message in ``binary``; ``count``: of its fields ("Versions and dialects")."""
     layouts = {SCAN: f"<BII{count - 4}qII", INIT: "<B3f3i", DRIVE: "<5B", INFO: "<BB6hf", END: "<BB"}
     return struct.Struct(layouts[kind])

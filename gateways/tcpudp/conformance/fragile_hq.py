@@ -24,7 +24,7 @@ from zbridge.simulation.timing import STAMPED, Read, ReadingThread
 _SMALLEST_READ = 6
 _WAITING = 1000
 DEPLOYED_PORT = 11000
-"""The UDP port that legacy programs bind ("Handshake", Ports)."""
+"""The UDP port that legacy programs bind ("Whose datagrams count")."""
 
 
 class _HqPhase(enum.Enum):
@@ -146,7 +146,8 @@ class FragileTcpUdpHq(OperatorProgram):
     def send(self, kind: int, body: bytes = b"") -> None:
         """Send a packet the way this version does; before the session is established and after its end it is lost.
 
-        1.3 sends 11, 12 and 61 by UDP whatever was agreed ("The gateway as robot"); the others where it was agreed.
+        1.3 sends 11, 12 and 61 by UDP whatever was agreed ("Datagrams, and whose they are" in ``fragile-robots.md``);
+        the others where it was agreed.
         """
         if self._phase is not _HqPhase.ESTABLISHED:
             self._event(f"lost: packet {kind} while {self._phase.name.lower()}")
@@ -186,7 +187,7 @@ class FragileTcpUdpHq(OperatorProgram):
             self._event(f"{_WAITING} reads wait, one was dropped")
 
     def _read_datagrams(self) -> None:
-        """Take datagrams from the robot's own address and port, no others ("Handshake", Ports)."""
+        """Take datagrams from the robot's own address and port, no others ("Links")."""
         assert self._udp is not None
         with contextlib.suppress(OSError):
             while True:
@@ -210,7 +211,7 @@ class FragileTcpUdpHq(OperatorProgram):
                 raise Ended(read.why or "the robot closed the connection")
 
     def _read_packet(self, read: Read) -> None:
-        """Take one read as one packet ("The gateway as robot")."""
+        """Take one read as one packet ("One packet per read" in ``fragile-robots.md``)."""
         if len(read.data) < _SMALLEST_READ:
             self._violate(f"a read of {len(read.data)} bytes, taken as a disconnect: {show(read.data)}")
             raise Ended("hung up: took a short read as a disconnect")
@@ -251,7 +252,7 @@ class FragileTcpUdpHq(OperatorProgram):
             self._obey(kind, body)
 
     def _untimely(self, kind: int) -> str:
-        """Return why a packet is not due, empty if it is ("Handshake", "Translation")."""
+        """Return why a packet is not due, or nothing ("The handshake with an HQ program", "Towards HQ programs")."""
         phase = self._phase
         if (kind == wire.SERVER_SETTINGS) != (phase is _HqPhase.CONNECTED):
             return "a second 2" if kind == wire.SERVER_SETTINGS else f"packet {kind} before the settings 2"
@@ -266,7 +267,7 @@ class FragileTcpUdpHq(OperatorProgram):
         question = wire.ANSWERS.get(kind)
         if question is not None and not self._unasked and question not in self._asked:
             return f"a {kind} to an HQ 1.1 that never asked ({question}): it has no handler"
-        refusal = kind == wire.DEBUG and phase is _HqPhase.ANSWERED  # "No common version: say so"
+        refusal = kind == wire.DEBUG and phase is _HqPhase.ANSWERED  # no common version ("Versions and dialects")
         due = refusal or phase in (_HqPhase.CONNECTED, _HqPhase.ESTABLISHED)
         return "" if due else f"packet {kind} before the session was established"
 
@@ -291,7 +292,7 @@ class FragileTcpUdpHq(OperatorProgram):
     # Handshake
 
     def _greet(self, body: bytes) -> None:
-        """Read the robot's settings and answer 3 a little later ("Settings and version negotiation")."""
+        """Read the robot's settings and answer 3 a little later ("The handshake with an HQ program")."""
         try:
             settings = wire.announced(body, self.version, skips_map_flag=self._skips)
         except ValueError as error:
@@ -320,7 +321,7 @@ class FragileTcpUdpHq(OperatorProgram):
         return None
 
     def _probe(self) -> None:
-        """Open the UDP socket, only now, and send 5 once ("Handshake" 4)."""
+        """Open the UDP socket, only now, and send 5 once ("Handshake")."""
         self._phase = _HqPhase.PROBING
         self._udp = socket.socket(self._tcp.family, socket.SOCK_DGRAM)
         self._udp.setblocking(False)
@@ -343,7 +344,7 @@ class FragileTcpUdpHq(OperatorProgram):
         self._send_status()
 
     def _conclude(self, works: bool) -> None:
-        """Take 6: programs of 1.1 and 1.2 believe in UDP after any ("The gateway as robot")."""
+        """Take 6: programs of 1.1 and 1.2 believe in UDP after any ("Whose datagrams count")."""
         self._answered = True
         self._works = works or self.version != "1.3"
         if not works:
@@ -351,7 +352,7 @@ class FragileTcpUdpHq(OperatorProgram):
         self._send_status()
 
     def _send_status(self) -> None:
-        """Send 7: whether a 6 came; 1.3 says true all the same ("Handshake" 6)."""
+        """Send 7: whether a 6 came; 1.3 says true all the same ("Whose datagrams count")."""
         if self._phase is _HqPhase.PROBING:
             connected = self._answered or self.version == "1.3"
             if not connected:
@@ -366,7 +367,7 @@ class FragileTcpUdpHq(OperatorProgram):
             self._start(self._repeat(self._repeat_s))
 
     async def _repeat(self, period_s: float) -> None:
-        """Repeat the stick, 13 while idle ("Packets")."""
+        """Repeat the stick, 13 while idle ("Stops are repeated" in ``fragile-robots.md``)."""
         while True:
             self.send(*self._stick)
             await asyncio.sleep(period_s)

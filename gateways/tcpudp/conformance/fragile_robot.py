@@ -95,7 +95,7 @@ class FragileRobot(FragileServer):
         self._parts_since = math.inf
 
     def _bind(self, host: str, port: int, sockets: contextlib.ExitStack) -> socket.socket:
-        """Bind TCP and UDP to the same number ("Handshake", Ports)."""
+        """Bind TCP and UDP to the same number ("Links")."""
         tcp, self._udp = bind_tcp_and_udp(host, port)
         sockets.enter_context(self._udp)
         return sockets.enter_context(tcp)
@@ -107,7 +107,7 @@ class FragileRobot(FragileServer):
     # TCP
 
     def _free(self) -> bool:
-        """Tell, with ``again``, whether the connection before has ended ("One usable connection per start")."""
+        """With ``again``: whether the last connection is over ("One connection per start" in ``fragile-robots.md``)."""
         return self._quirks.again and self._conn is None
 
     def _begin(self, conn: socket.socket) -> None:
@@ -160,7 +160,7 @@ class FragileRobot(FragileServer):
             await self._judge(received, "tcp")
 
     async def _send(self, kind: int, body: bytes = b"", *, by_udp: bool = False) -> None:
-        """Send by UDP what the table marks UDP* when that was agreed, all else by TCP ("Packets")."""
+        """Send by UDP what the table marks UDP* when that was agreed, all else by TCP ("Versions and dialects")."""
         data = wire.packet(kind, body)
         if self._phase is _RobotPhase.ESTABLISHED and self._loses():
             return
@@ -188,7 +188,7 @@ class FragileRobot(FragileServer):
             await self._datagram(data, source[:2])
 
     async def _datagram(self, data: bytes, source: tuple[str, int]) -> None:
-        """Take one datagram ("The gateway as HQ": no UDP before TCP, no wrong length field)."""
+        """Take one datagram ("What crashes a peer" in ``fragile-robots.md``: none may come before its packet 4)."""
         if self._loses():
             return
         if self._phase is _RobotPhase.FROZEN:
@@ -213,7 +213,7 @@ class FragileRobot(FragileServer):
             await self._judge(received, "udp")
 
     async def _probe(self) -> None:
-        """Answer the first 5 with 6(true) from the TCP port's number, to where it came from ("Handshake" 5)."""
+        """Answer the first 5 with 6(true) from the TCP port's number, to where it came from ("Handshake")."""
         self._probes += 1
         if self._probes > 1:
             self._violate(f"{self._probes} probes 5 by UDP instead of one")
@@ -283,7 +283,7 @@ class FragileRobot(FragileServer):
     # Handshake
 
     async def _settle(self, body: bytes) -> None:
-        """Take the HQ's settings; judge its version string ("Settings and version negotiation")."""
+        """Take the HQ's settings; judge its version string ("Versions and dialects")."""
         if self._phase is not _RobotPhase.GREETED:
             return self._violate(f"a second clientSettings: {show(body)}")
         settings = wire.client_settings(body)
@@ -299,7 +299,7 @@ class FragileRobot(FragileServer):
         return self._establish()
 
     async def _offer_udp(self) -> None:
-        """Send 4, sleep, then take in one read what came meanwhile: the single 7 ("Handshake" 3 to 6)."""
+        """Send 4, sleep, then take in one read what came meanwhile: the single 7 ("Handshake")."""
         self._offered, self._phase = True, _RobotPhase.ASLEEP
         self._wake_at = time.monotonic() + self._times.probe_s
         self._quiet_until = time.monotonic() + self._times.silence_s
@@ -363,7 +363,7 @@ class FragileRobot(FragileServer):
             self.machine.step(min(ticker.passed_s, _MOST_MOVE_S))
 
     async def _send_parts(self, conn: socket.socket | None) -> None:
-        """Send the map in parts again and again; TCP is read meanwhile ("The gateway as HQ")."""
+        """Send the map in parts again and again; TCP is read meanwhile ("Limits")."""
         while True:
             for body in self.machine.parts(self._quirks.parts):
                 if self._conn is not conn:

@@ -1,4 +1,7 @@
-"""The simulated robot of the judge: it moves, sees and talks ("Packets", "Translation"). Sans-IO: no clock."""
+"""The simulated robot of the judge: it moves, sees and talks ("Versions and dialects", "Translation from the robot").
+
+Sans-IO: no clock.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +50,7 @@ class Quirks(msgspec.Struct, frozen=True, kw_only=True):
     """The fraction of packets dropped after the handshake, chosen for each packet id by itself."""
     again: bool = False
     """It serves a connection after the first, which loses half of all packets in both directions and gets no telemetry
-    ("One usable connection")."""
+    ("Signs of a poor connection")."""
 
 
 class JudgedRobot:
@@ -64,7 +67,7 @@ class JudgedRobot:
         self._map = grid.cells.tobytes()
 
     def steer(self, body: bytes) -> None:
-        """Take the body of 11 (12 bytes), 12 (4 bytes) or 13 (none): y forward, x right, + right ("Packets")."""
+        """Take a body of 11 (12 bytes), 12 (4), 13 (none): y forward, x right, + right ("Translation of commands")."""
         if self._on_its_own:
             return
         x, y, speed = struct.unpack("<3f", body) if len(body) == 12 else (0.0, 0.0, 0.0)
@@ -73,9 +76,10 @@ class JudgedRobot:
         self._drive = (y * speed * _SPEED_M_S, -x * speed * _SPEED_M_S, -turn * _TURN_RAD_S)
 
     def choose(self, body: bytes) -> None:
-        """Take the body of 10: in mode 3 the robot's own program drives, despite any 13 ("Translation").
+        """Take the body of 10: in mode 3 the robot's own program drives, despite any 13.
 
         When it ends, the motors keep running: only a 13 after it stops them.
+        Source: "Stops are repeated" in ``fragile-robots.md``.
         """
         self._on_its_own = body[0] == 3
         if self._on_its_own:
@@ -93,7 +97,7 @@ class JudgedRobot:
         self.place.step(*self._drive, dt)
 
     def body(self, kind: int) -> bytes:
-        """Return the body of a packet about the robot as it is ("Packets", "Translation")."""
+        """Return a packet's body for the robot as it is ("Versions and dialects", "Translation from the robot")."""
         if kind == wire.DEBUG:
             return string(f"battery {self._random.randint(0, 100)} %")
         if kind == wire.CHAT:
@@ -109,7 +113,7 @@ class JudgedRobot:
         return struct.pack("<i", len(self._map)) + self._map if kind == wire.MAP else b""
 
     def parts(self, count: int) -> Iterator[bytes]:
-        """Return the bodies of the map's parts; the last runs past the end of the map ("The gateway as HQ")."""
+        """Return the bodies of the map's parts; the last runs past the map's end ("Translation from the robot")."""
         size = len(self._map) // count + 1
         for start in range(0, len(self._map), size):
             yield struct.pack("<ii", start, start + size) + self._map[start : start + size].ljust(size, b"\0")
@@ -117,9 +121,9 @@ class JudgedRobot:
     def unasked(
         self, version: str, features: Collection[FeatureFlag], hq_features: Collection[FeatureFlag]
     ) -> Iterator[tuple[int, bytes]]:
-        """Yield what the robot sends unasked, forever; once a debugMessage with two headers ("The gateway as HQ").
+        """Yield what the robot sends unasked, forever; once a debugMessage with two headers.
 
-        An empty body: ask :meth:`body` for it when it is sent.
+        An empty body: ask :meth:`body` for it when it is sent. Source: "Decisions where the document is silent".
         """
         due = [(wire.DEBUG, packet(wire.DEBUG, string("two headers")))]
         kinds = (

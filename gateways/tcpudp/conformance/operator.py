@@ -1,4 +1,4 @@
-"""What the operator of an HQ program does; the judge decides when and how that is sent ("Packets")."""
+"""What the operator of an HQ program does; the judge decides when and how that is sent ("Versions and dialects")."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class OperatorProgram(HqProgram):
     async def neutral(self) -> None:
         if not self._joystick:
             self._joystick = True
-            self.mode(2)  # joystick ("Packets")
+            self.mode(2)  # joystick ("Versions and dialects")
         self.idle()
 
     async def push(self, forward: float, turn: float) -> None:

@@ -16,7 +16,7 @@ Channel = Literal["tcp", "udp"]
 
 DATAGRAM_BYTES = 65536
 READ_BYTES = 4096
-"""Most bytes of one read, and so of one packet ("The gateway as HQ": nothing over 4096 bytes)."""
+"""Most bytes of one read, and so of one packet ("Limits": nothing over 4096 bytes)."""
 SERVER_ID = 1
 DEBUG, SERVER_SETTINGS, CLIENT_SETTINGS = 1, 2, 3
 START_UDP, UDP_PROBE, UDP_ANSWER, UDP_STATUS = 4, 5, 6, 7
@@ -25,14 +25,14 @@ CAMERA, CHAT = 31, 40
 LIDAR_MODE, LIDAR_STATUS, GET_MAP, MAP, GET_POSITION, POSITION, MAP_PART = 50, 51, 52, 53, 54, 55, 56
 GET_SCAN, SCAN = 60, 61
 BY_UDP = frozenset({MOVE, ROTATE, SCAN, MAP, POSITION, MAP_PART})
-"""The packets marked UDP* ("Packets")."""
+"""The packets marked UDP* ("Versions and dialects")."""
 SIDE, CELL_CM = 100, 10
 """Cells along a side of the simulated map, and SLAMMapIntervall; the largest maps of the field have 2048."""
 _TAIL_BYTES = 1 << 20
 
 
 class FeatureFlag(enum.IntEnum):
-    """A feature flag; the value is its place in the settings ("Settings and version negotiation")."""
+    """A feature flag; the value is its place in the settings ("Versions and dialects")."""
 
     UDP = 0
     CAM = 1
@@ -52,7 +52,7 @@ UNDERSTOOD = {"1.1": "1.1", "1.2": "1.2", "1.3": "1.1,1.2,1.3", "1.4": "1.1,1.2,
 DEADLY_ENTRIES = frozenset({1, 2, 4, 8})
 """Lengths of a version list that crash robots 1.3 and "1.4"."""
 HQ_LOSES_BYTES = 2200
-"""An HQ loses TCP packets of so many bytes and more ("The gateway as robot")."""
+"""An HQ loses TCP packets of so many bytes and more ("Towards HQ programs")."""
 HQ_SENT = {"1.1": "1.1", "1.2": "1.2", "1.3": "1.1,1.2,1.3"}
 """The version string an HQ sends."""
 ANSWERS = {MAP: GET_MAP, POSITION: GET_POSITION}
@@ -61,7 +61,7 @@ _TO_ALL = frozenset({DEBUG, SERVER_SETTINGS, START_UDP, UDP_ANSWER, LIDAR_STATUS
 KNOWN_TO_HQ = {"1.1": _TO_ALL, "1.2": _TO_ALL | {GET_SCAN}, "1.3": _TO_ALL | {GET_SCAN}}
 """The packet ids that do not cripple an HQ of a version."""
 IGNORE_ONE = frozenset({"1.1", "1.2"})
-"""Versions of robots that ignore the first packet read alone after a stall ("The gateway as robot")."""
+"""Robots that ignore the first packet read alone after a stall ("Stops are repeated" in ``fragile-robots.md``)."""
 
 
 class RobotTimes(msgspec.Struct, frozen=True, kw_only=True):
@@ -133,7 +133,7 @@ class RobotAnnouncement(msgspec.Struct, frozen=True):
 
 
 def cut(data: bytes) -> tuple[list[ParsedPacket], bytes, bool]:
-    """Cut packets off the front ("Framing"); give them, what is left, and whether that is hopeless."""
+    """Cut packets off the front ("Versions and dialects"); give them, what is left, and whether that is hopeless."""
     packets: list[ParsedPacket] = []
     while len(data) >= 4:
         (length,) = struct.unpack_from("<i", data)
@@ -147,7 +147,7 @@ def cut(data: bytes) -> tuple[list[ParsedPacket], bytes, bool]:
 
 
 class ReadChecker:
-    """Checks the reads of one TCP connection: each must be exactly one packet ("The gateway as HQ")."""
+    """Checks reads of TCP: each must be exactly one packet ("One packet per read" in ``fragile-robots.md``)."""
 
     def __init__(self, most: int = READ_BYTES) -> None:
         self.joined: list[ParsedPacket] = []
@@ -186,7 +186,7 @@ class ReadChecker:
 
 
 def due_channel(kind: int, body: bytes, *, offered: bool, works: bool | None) -> Channel | None:
-    """Return what must carry a packet of the robot ("Packets"); None: either, as without a 6 nothing was agreed.
+    """Return what must carry a packet of the robot ("Versions and dialects"); None: either, as nothing was agreed.
 
     ``offered``: the robot sent 4; ``works``: whether UDP was agreed, None until a 6 came.
     """
@@ -198,23 +198,23 @@ def due_channel(kind: int, body: bytes, *, offered: bool, works: bool | None) ->
 
 
 def datagram(data: bytes) -> ParsedPacket | None:
-    """Read a datagram as exactly one packet; none where its length field is wrong ("Framing")."""
+    """Read a datagram as exactly one packet; none where its length field is wrong ("Versions and dialects")."""
     packets, rest, _ = cut(data)
     return packets[0] if len(packets) == 1 and not rest else None
 
 
 def packet(kind: int, body: bytes = b"", sender: int = SERVER_ID) -> bytes:
-    """Write a packet, of the robot by default ("Framing")."""
+    """Write a packet, of the robot by default ("Versions and dialects")."""
     return struct.pack("<iBB", 2 + len(body), sender, kind) + body
 
 
 def string(text: str) -> bytes:
-    """Write a string ("Framing")."""
+    """Write a string: the number of its bytes, then ASCII."""
     return struct.pack("<i", len(text)) + text.encode("ascii")
 
 
 def server_settings(version: str, client: int, features: Collection[FeatureFlag], side: int = SIDE) -> bytes:
-    """Write the body of packet 2 as a robot of ``version`` does ("Settings and version negotiation")."""
+    """Write the body of packet 2 as a robot of ``version`` does ("Versions and dialects")."""
     flags = bytes(flag in features for flag in list(FeatureFlag)[: FLAGS[version]])
     sizes = struct.pack("<ii", side * CELL_CM, CELL_CM) if FLAGS[version] == 7 else b""
     return bytes([client]) + string(SENT[version]) + flags + sizes
@@ -230,7 +230,7 @@ def announcement(version: str, features: Collection[FeatureFlag] | None, *, udp:
 
 
 def client_settings(body: bytes) -> HqAnnouncement:
-    """Read the body of packet 3 ("Settings and version negotiation")."""
+    """Read the body of packet 3 ("Versions and dialects")."""
     nothing: frozenset[FeatureFlag] = frozenset()
     count = struct.unpack_from("<i", body)[0] if len(body) >= 4 else -1
     if not 0 <= count <= len(body) - 4 or not body[4 : 4 + count].isascii():
@@ -246,7 +246,7 @@ def client_settings(body: bytes) -> HqAnnouncement:
 def announced(body: bytes, version: str, *, skips_map_flag: bool = False) -> RobotAnnouncement:
     """Read the body of packet 2 as an HQ of ``version`` does; ValueError for what cripples it.
 
-    ``skips_map_flag``: it looks for the map's size where the SLAMMap flag is ("The gateway as robot").
+    ``skips_map_flag``: it finds the map's size where the SLAMMap flag is ("Protocol tcpudp" in ``configuration.md``).
     """
     count = struct.unpack_from("<i", body, 1)[0] if len(body) >= 5 else -1
     if not 0 <= count <= len(body) - 5 or not body[5 : 5 + count].isascii():
@@ -269,14 +269,14 @@ def announced(body: bytes, version: str, *, skips_map_flag: bool = False) -> Rob
 
 
 def _understood(version: str, versions: str) -> str:
-    """Return as which version's an HQ reads settings, empty if as none ("Settings and version negotiation")."""
+    """Return as which version's an HQ reads settings, empty if as none ("Versions and dialects")."""
     if version != "1.3":
         return version if versions == version else ""
     return next((known for known in ("1.3", "1.2", "1.1") if known in versions.split(",")), "")
 
 
 def announced_problem(settings: RobotAnnouncement, *, skips_map_flag: bool = False) -> str:
-    """Return what is wrong with packet 2 without crippling an HQ ("Settings and version negotiation")."""
+    """Return what is wrong with packet 2 without crippling an HQ ("Versions and dialects")."""
     newest = max((known for known in settings.versions.split(",") if known in FLAGS), default="")
     size = FLAGS[newest] + 8 * (FLAGS[newest] == 7) if newest else len(settings.block)
     if len(settings.block) != size and not (skips_map_flag and len(settings.block) == size - 1 == 14):
@@ -285,12 +285,15 @@ def announced_problem(settings: RobotAnnouncement, *, skips_map_flag: bool = Fal
 
 
 def deadly(version: str, settings: HqAnnouncement) -> bool:
-    """Return whether a version list crashes a robot ("Settings and version negotiation")."""
+    """Return whether a version list crashes a robot ("What crashes a peer" in ``fragile-robots.md``)."""
     return "," in SENT[version] and settings.readable and len(settings.versions.split(",")) in DEADLY_ENTRIES
 
 
 def registered(version: str, features: Collection[FeatureFlag]) -> frozenset[int]:
-    """Return which packet ids from the HQ do not crash a robot ("Packets", "The gateway as HQ")."""
+    """Return which packet ids from the HQ do not crash a robot.
+
+    Source: "Versions and dialects" of the protocol page, "What crashes a peer" in ``fragile-robots.md``.
+    """
     ids = {DEBUG, CLIENT_SETTINGS}.union(*(_REGISTERED.get(feature, ()) for feature in features))
     if maps(version, features):
         ids |= {GET_MAP, GET_POSITION}
@@ -307,7 +310,7 @@ def maps(version: str, features: Collection[FeatureFlag]) -> bool:
 def body_problem(kind: int, body: bytes) -> str:
     """Return what is wrong with a body, empty if nothing: a robot survives it, but for an empty text; an HQ does not.
 
-    Source: "Packets", "The gateway as robot".
+    Source: "Versions and dialects" of the protocol page, "What crashes a peer" in ``fragile-robots.md``.
     """
     size = _SIZES.get(kind, len(body))
     if len(body) != size:
@@ -317,7 +320,7 @@ def body_problem(kind: int, body: bytes) -> str:
 
 
 def value_problem(kind: int, body: bytes, side: int) -> str:
-    """Return what values a body has that the page does not know; ``side``: announced cells, 0 if none ("Packets")."""
+    """Return what values the page does not know; ``side``: announced cells or 0 ("Versions and dialects")."""
     if kind == LIDAR_STATUS:
         return _one_of("lidar status", (1, 2))(body)
     if kind == POSITION and not all(map(math.isfinite, struct.unpack("<3f", body))):

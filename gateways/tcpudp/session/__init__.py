@@ -1,7 +1,7 @@
 """Conversations of the TCP/UDP package protocol: framing, ``id`` bytes and channels, as both roles share them. Sans-IO.
 
 ``hq_role`` plays HQ towards a robot; ``robot_role`` plays the robot towards an
-HQ program. Source: "Framing" and "Packets" of the protocol page.
+HQ program. Source: "Versions and dialects" of the protocol page.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class PacketSession(Session[Packet]):
         return ProtocolError(f"packet {packet_id} with id {sender_id}, which is not the peer's")
 
     def refuse_versions(self, listed: str, ours: Iterable[str], now: float) -> None:
-        """Close for lack of a common version, with a text to the peer ("Settings and version negotiation")."""
+        """Close for lack of a common version, with a text to the peer ("Versions and dialects")."""
         reason = f"{NO_COMMON_VERSION}: the peer speaks {listed[:_QUOTED]!r}, this gateway {', '.join(ours)}"
         self.send(DebugMessage(reason))
         self.close(reason, now)

@@ -1,6 +1,6 @@
 """The gateway plays HQ towards one robot: the handshake, which packets may be sent, when they are repeated. Sans-IO.
 
-Source: "Handshake", "Settings and version negotiation", "The gateway as HQ" and "Translation" of the protocol page.
+Source: "Handshake", "Versions and dialects", "Translation of commands" and "Limits" of the protocol page.
 
 Theory of operation. The handshake is the table at the foot of this file: :class:`HqStep` says what the session waits
 for, :class:`HqEvent` what can happen, and every row names the action that is taken. The session is ``established`` from

@@ -1,6 +1,7 @@
 """The gateway plays the robot towards one HQ program, and decides whose datagrams are that program's. Sans-IO.
 
-Source: "Handshake", "Settings and version negotiation" and "The gateway as robot" of the protocol page.
+Source: "The handshake with an HQ program", "Whose datagrams count", "Versions and dialects" and
+"Towards HQ programs" of the protocol page.
 
 Theory of operation. The handshake is the table at the foot of this file: :class:`RobotStep` says what the session waits
 for, :class:`RobotEvent` what can happen, and every row names the action that is taken. The session is ``established``

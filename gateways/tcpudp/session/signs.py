@@ -1,6 +1,6 @@
 """The signs that a connection is not the robot's one usable connection. Sans-IO.
 
-Source: "One usable connection per start" of the protocol page.
+Source: "Signs of a poor connection" of the protocol page.
 """
 
 from __future__ import annotations

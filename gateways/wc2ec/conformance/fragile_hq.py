@@ -41,7 +41,7 @@ class FragileExternalController(HqProgram):
         super().__init__()
         self.dialect: Dialect = dialect
         self.ready = asyncio.Event()
-        """Set by the first data after the connection: before that it does nothing ("The gateway as Webots ...")."""
+        """Set by the first data; before that it does nothing ("What crashes a peer" in ``fragile-robots.md``)."""
         self.devices: dict[int, tuple[int, str]] = {}
         """Type and name of what was registered, by number."""
         self.values: dict[int, float] = {}
@@ -81,13 +81,13 @@ class FragileExternalController(HqProgram):
         await self.push(0.0, 0.0)
 
     async def push(self, forward: float, turn: float) -> None:
-        """Set both wheels, those of two motors whose names say left and right, once ("Roles")."""
+        """Set both wheels, those of two motors whose names say left and right, once ("Towards HQ programs")."""
         for side, sign in (("left", -1.0), ("right", 1.0)):
             if side in self._wheels:
                 await self.set(self._wheels[side], WHEEL_RAD_S * max(-1.0, min(1.0, forward + sign * turn)))
 
     async def end(self) -> None:
-        """Leave, by closing the connection: the protocol has no message for it ("Roles")."""
+        """Leave, by closing the connection: the protocol has no message for it ("Versions and dialects")."""
         if self._conn is not None:
             self._event("the external controller left")
             self._stop()
@@ -96,7 +96,7 @@ class FragileExternalController(HqProgram):
     # Commands; all raise ConnectionError without a connection
 
     async def set(self, device: str | int, value: float) -> None:
-        """Send setValue to a device by name or number ("Dialect `deployed`" 130); KeyError if it is not registered.
+        """Send setValue to a device by name or number ("Versions and dialects", 130); KeyError if it is not registered.
 
         Waits until it is ready: before that a controller does nothing.
         """
@@ -108,13 +108,13 @@ class FragileExternalController(HqProgram):
         await self._send(wire.SET_VALUE, self.devices[number][0], number, [struct.pack("<d", value)])
 
     async def enable(self, number: int) -> None:
-        """Send enableSensor ("Dialect `draft`" 128)."""
+        """Send enableSensor ("Versions and dialects", 128)."""
         self._only("draft")
         self.enabled.add(number)
         await self._send(wire.ENABLE, wire.LIGHT_TYPE, number, [])
 
     async def disable(self, number: int) -> None:
-        """Send disableSensor ("Dialect `draft`" 129)."""
+        """Send disableSensor ("Versions and dialects", 129)."""
         self._only("draft")
         await self._send(wire.DISABLE, wire.LIGHT_TYPE, number, [])
         if number in self.enabled:
@@ -122,12 +122,12 @@ class FragileExternalController(HqProgram):
         self.enabled.discard(number)
 
     async def change(self, number: int, index: int, value: float) -> None:
-        """Send changeSensor, one configuration value ("Dialect `draft`" 130)."""
+        """Send changeSensor, one configuration value ("Versions and dialects", 130)."""
         self._only("draft")
         await self._send(wire.CHANGE, wire.LIGHT_TYPE, number, [bytes([index]), struct.pack("<d", value)])
 
     async def configure(self, number: int, values: list[float]) -> None:
-        """Send setSensor, all configuration values ("Dialect `draft`" 131)."""
+        """Send setSensor, all configuration values ("Versions and dialects", 131)."""
         self._only("draft")
         await self._send(wire.SET, wire.LIGHT_TYPE, number, [struct.pack("<d", value) for value in values])
 
@@ -136,7 +136,7 @@ class FragileExternalController(HqProgram):
             raise ValueError(f"no command of dialect {self.dialect}")
 
     async def _send(self, command: int, node_type: int, number: int, body: list[bytes]) -> None:
-        """Send a command joined or field by field ("Commands arrive split (1+1+1+8 bytes) or joined")."""
+        """Send a command joined or field by field ("Versions and dialects": three bytes and a body)."""
         fields = [bytes([command]), bytes([node_type]), bytes([number]), *body]
         async with self._sending:
             for place, part in enumerate(fields if self._split else [b"".join(fields)]):
@@ -157,7 +157,7 @@ class FragileExternalController(HqProgram):
         self.ready.set()
 
     async def _live(self) -> None:
-        """Read and judge until the connection is over ("EOF ... ends its task silently")."""
+        """Read and judge until the connection is over."""
         while True:
             await self._read()
 
@@ -177,10 +177,10 @@ class FragileExternalController(HqProgram):
         elif isinstance(value, float):
             self._measure(message, value, raw)
         else:
-            self._event(f"error: {raw}")  # "sent by nobody; harmless"
+            self._event(f"error: {raw}")  # harmless, and sent by nobody
 
     def _register(self, message: ParsedWc2EcMessage, name: str, raw: str) -> None:
-        """Take a registration ("Register each name once (a duplicate kills the deployed EC)"; "index (0..254)")."""
+        """Take a registration ("Towards HQ programs": each name once; "Limits": 255 numbers)."""
         number = message.number
         if name in self._names:
             self._die(f"{name!r} registered again: {raw}")

@@ -31,7 +31,7 @@ _DEPLOYED = Wc2EcTimes()
 class FragileWebotsController(FragileServer):
     """One start of a simulation: serves one external controller, records every violation, dies of the deadly ones.
 
-    It ends when its external controller leaves ("Roles"). ``devices``: default those of ``DEFAULT``; ``values``:
+    It ends when its external controller leaves ("Links"). ``devices``: default those of ``DEFAULT``; ``values``:
     configuration values of a sensor of the draft. A row of ``received``: monotonic seconds, command, sensor type,
     sensor number, value; of a command that it read, valid or not.
     """
@@ -101,7 +101,7 @@ class FragileWebotsController(FragileServer):
             await ticker.tick()
 
     async def _register(self) -> None:
-        """Register all devices, the last one after ``register_s`` ("Sequence"); a command before it is too early."""
+        """Register all devices, the last one after ``register_s`` ("Handshake"); a command before it is too early."""
         if self.registered:
             return
         registrations = [wire.registration(device) for device in self.devices]
@@ -132,7 +132,7 @@ class FragileWebotsController(FragileServer):
         self._take(data, self._broken or end)
 
     def _judge_end(self, end: str) -> NoReturn:
-        """Judge an end of the connection, and exit ("Roles": it exits when that one disconnects)."""
+        """Judge an end of the connection, and exit ("Links": it exits after a disconnect)."""
         if self._reader.rest:
             self._violate(f"the connection ended within a command: {show(self._reader.rest)}")
         moving = "moving" if self.robot.moving else "at rest"

@@ -36,7 +36,7 @@ _COMMANDS = {"deployed": (SET_VALUE,), "draft": (ENABLE, DISABLE, CHANGE, SET)}
 
 
 class DeviceKind(enum.Enum):
-    """What a device is for the legacy controller, whatever its Webots node type ("the numbers move")."""
+    """What a device is for the legacy controller, whatever its type byte ("Decisions where the document is silent")."""
 
     DISTANCE = enum.auto()
     LIGHT = enum.auto()
@@ -96,7 +96,7 @@ class ParsedWc2EcMessage(msgspec.Struct, frozen=True):
 
 
 def check(dialect: Dialect, devices: Collection[SimulatedDevice]) -> None:
-    """Refuse devices that a controller cannot have with ValueError ("Dialect ...", "Register each name once")."""
+    """Refuse devices that a controller cannot have with ValueError ("Versions and dialects", "Towards HQ programs")."""
     for device in devices:
         if not 0 <= device.number <= MOST_NUMBER or not 0 <= device.node_type <= 255:
             raise ValueError(f"{device!r}: number or type out of range")
@@ -109,14 +109,14 @@ def check(dialect: Dialect, devices: Collection[SimulatedDevice]) -> None:
 
 
 class _Wc2EcReader(MessageReader[ParsedWc2EcMessage]):
-    """Cuts the stream of either side ("no length, the body follows from command and type")."""
+    """Cuts the stream of either side ("Versions and dialects": the body depends on the command)."""
 
     def __init__(self, dialect: Dialect) -> None:
         super().__init__()
         self._dialect: Dialect = dialect
 
     def _lost(self, data: bytes) -> str:
-        """Return why the framing is lost, empty if it is not ("check the range"; "Dialect ...": the commands)."""
+        """Return why the framing is lost, empty if it is not ("Limits"; "Versions and dialects": the commands)."""
         if problem := self._unknown(data[0]):
             return problem
         if self._dialect == "draft" and len(data) > 1 and data[1] != LIGHT_TYPE:
@@ -136,8 +136,9 @@ class _Wc2EcReader(MessageReader[ParsedWc2EcMessage]):
 class ExternalReader(_Wc2EcReader):
     """Cuts and judges the stream of an external controller, one read at a time.
 
-    What it cannot frame it throws away with the rest of the read. ``blocked``: a 130 went to no motor, and "every later
-    command is stuck". ``values``: how many configuration values a sensor of the draft has.
+    What it cannot frame it throws away with the rest of the read. ``blocked``: a 130 went to no motor, and every later
+    command is stuck ("What crashes a peer" in ``fragile-robots.md``). ``values``: how many configuration values a
+    sensor of the draft has.
     """
 
     def __init__(self, dialect: Dialect, devices: Collection[SimulatedDevice], values: int) -> None:
@@ -174,7 +175,7 @@ class ExternalReader(_Wc2EcReader):
         return self._deployed(raw) if self._dialect == "deployed" else self._draft(raw)
 
     def _deployed(self, raw: bytes) -> ParsedWc2EcMessage:
-        """Judge a setValue ("send 130 only to registered motors"; "NaN and infinities")."""
+        """Judge a setValue ("Translation of commands": only to registered motors, no NaN and no infinities)."""
         command, node_type, number, value = _FLOAT.unpack(raw)
         device = self._devices.get(number)
         if device is None:
@@ -235,13 +236,13 @@ class ControllerReader(_Wc2EcReader):
 
 
 def registration(device: SimulatedDevice) -> bytes:
-    """Write a registration ("Dialect `deployed`" 0)."""
+    """Write a registration ("Versions and dialects": deployed, 0)."""
     name = device.name.encode()
     return struct.pack("<BBBB", REGISTER, device.node_type, device.number, len(name)) + name
 
 
 def measurement(dialect: Dialect, device: SimulatedDevice, value: float) -> bytes:
-    """Write sensorData ("Dialect `deployed`" 1, "Dialect `draft`" 0)."""
+    """Write sensorData ("Versions and dialects": deployed, 1; draft, 0)."""
     return _FLOAT.pack(DATA[dialect], device.node_type, device.number, value)
 
 

@@ -1,4 +1,4 @@
-"""The five messages in both dialects, by hand from the protocol page, sections "Text" and "Binary"."""
+"""The five messages in both dialects, by hand from "Versions and dialects" of the protocol page."""
 
 from typing import Any
 

@@ -106,7 +106,7 @@ def test_speed_is_percent_and_above_100_without_clamping_in_text_and_100_in_bina
 
 
 def test_its_motor_stops_after_2_s_of_silence_and_not_much_earlier() -> None:
-    """20 cycles of 20 ticks at 200 Hz ("Dialect `text`", 3)."""
+    """20 cycles of 20 ticks at 200 Hz ("Translation of commands")."""
     moved = car(-4.5)
     live(moved, 1.0, command(20))
     full = moved.speed_m_s

@@ -1,4 +1,7 @@
-"""Units, axes, signs and refusals of ALF, worked out by hand from "Translation" and "The gateway as HQ" of the page."""
+"""Units, axes, signs and refusals of ALF, worked out by hand.
+
+Source: "Translation from the robot" and "Translation of commands" of the protocol page.
+"""
 
 import contextlib
 import math

@@ -1,4 +1,4 @@
-"""Packets written by hand after "Framing" and "Settings" of the protocol page, and a session on a clock of its own.
+"""Packets written by hand after "Versions and dialects" of the protocol page, and a session on a clock of its own.
 
 Nothing here encodes with the code under test.
 """

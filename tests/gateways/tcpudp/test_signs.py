@@ -1,4 +1,4 @@
-"""Signs of a connection that is not the robot's first ("One usable connection" of the protocol page)."""
+"""Signs of a connection that is not the robot's first ("Signs of a poor connection" of the protocol page)."""
 
 from __future__ import annotations
 

@@ -271,7 +271,7 @@ async def test_a_process_that_is_late_itself_reproaches_nobody() -> None:
 
 
 async def test_the_motor_stops_two_seconds_after_the_last_command_as_the_deployed_one_does() -> None:
-    """20 cycles of 20 ticks at 200 Hz ("Dialect `text`", 3)."""
+    """20 cycles of 20 ticks at 200 Hz ("Translation of commands")."""
     vehicle = quick(times=AlfTimes(first_s=5, gap_s=5, window_commands=0))
     async with connected(vehicle) as hq:
         await hq.play(["> GOOD FORWARD", "? 2 s without a command: the motor stopped by itself, moving"])

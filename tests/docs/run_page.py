@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from tests.docs.pages import ROOT, Block, blocks, difference, exchanges
@@ -74,7 +74,7 @@ class Page:
                 self._block(block)
 
     @contextlib.contextmanager
-    def _at(self, block: Block):  # type: ignore[no-untyped-def]
+    def _at(self, block: Block) -> Iterator[None]:
         try:
             yield
         except (OSError, subprocess.TimeoutExpired, PageError) as error:

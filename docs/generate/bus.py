@@ -5,12 +5,11 @@ from __future__ import annotations
 import ast
 import inspect
 from collections.abc import Iterator
-from itertools import pairwise
 from types import ModuleType
 
 import msgspec
 
-from docs.generate.declared import fields, plain, summary, table
+from docs.generate.declared import documented, fields, summary, table
 from zbridge.fleet import lease_messages, messages, processes, topics
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import QOS, Delivery, Topic
@@ -18,19 +17,9 @@ from zbridge.fleet.topics import QOS, Delivery, Topic
 COMMON = FleetMessage.__struct_fields__
 
 
-def documented(module: ModuleType) -> dict[str, str]:
-    """Read the docstrings of a module's constants: a string below each."""
-    body = ast.parse(inspect.getsource(module)).body
-    told = {}
-    for statement, below in pairwise(body):
-        if isinstance(statement, ast.Assign) and isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant):
-            told[ast.unparse(statement.targets[0])] = plain(str(below.value.value))
-    return told
-
-
 def declared() -> Iterator[tuple[str, Topic, str]]:
     """Give each topic with its path, where ``<name>`` stands for the last part of a family, and its meaning."""
-    told = documented(topics)
+    told = documented(ast.parse(inspect.getsource(topics)).body)
     for name, value in vars(topics).items():
         if isinstance(value, Topic):
             yield value.path, value, told.get(name, "")

@@ -5,12 +5,11 @@ from __future__ import annotations
 import ast
 import inspect
 from collections.abc import Iterator
-from itertools import pairwise
 
 import typer.main
 from typer.core import TyperArgument, TyperCommand, TyperGroup, TyperOption
 
-from docs.generate.declared import plain, table
+from docs.generate.declared import documented, plain, table
 from zbridge import errors
 from zbridge.cli.app import app
 from zbridge.doctor.robot import REMEDIES
@@ -70,19 +69,10 @@ def bus_options(group: TyperGroup) -> list[TyperOption]:
 def refusals() -> str:
     """Write every code with the class that Python raises, what it means and what to do."""
     families = {code: family for family in Refused.__subclasses__() for code in family.codes}
-    told = code_meanings()
-    rows = ((f"`{code}`", f"`{families[code].__name__}`", told[code.name], REMEDIES[code]) for code in Code)
-    return table(("code", "class of `zbridge.errors`", "when", "what to do"), rows)
-
-
-def code_meanings() -> dict[str, str]:
-    """Read the docstrings of the codes."""
     (body,) = (node.body for node in ast.parse(inspect.getsource(errors)).body if getattr(node, "name", "") == "Code")
-    told = {}
-    for statement, below in pairwise(body):
-        if isinstance(statement, ast.Assign) and isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant):
-            told[ast.unparse(statement.targets[0])] = plain(str(below.value.value)).rstrip(".")
-    return told
+    told = documented(body)
+    rows = ((f"`{code}`", f"`{families[code].__name__}`", told[code.name].rstrip("."), REMEDIES[code]) for code in Code)
+    return table(("code", "class of `zbridge.errors`", "when", "what to do"), rows)
 
 
 def sections() -> dict[str, str]:

@@ -5,9 +5,11 @@ Docstrings explain fields as ``name: text.`` or ``name, other: text.`` after the
 
 from __future__ import annotations
 
+import ast
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import msgspec
@@ -56,7 +58,7 @@ def plain(text: str) -> str:
 
 
 def fields(struct: type[msgspec.Struct]) -> list[Field]:
-    """Return the fields of a struct in their order, without what every message has."""
+    """Return the fields of a struct in their order."""
     info = inspect.type_info(struct)
     assert isinstance(info, inspect.StructType)
     told = meanings(struct)
@@ -88,9 +90,18 @@ def summary(struct: type[Any]) -> str:
 
 
 def split(struct: type[Any], names: Iterable[str]) -> list[str]:
-    """Split a docstring at the labels of fields: what comes before, then labels and texts by turns."""
+    """Split a docstring at the labels of fields: what comes before, then alternating labels and texts."""
     known = "|".join(sorted(names, key=len, reverse=True)) or "-"
-    return re.split(rf"(?:(?<=[.\s] )|(?<=\. )|^)((?:{known})(?:, (?:{known}))*): ", plain(struct.__doc__ or ""))
+    return re.split(rf"(?:(?<=\. )|^)((?:{known})(?:, (?:{known}))*): ", plain(struct.__doc__ or ""))
+
+
+def documented(body: list[ast.stmt]) -> dict[str, str]:
+    """Read the docstrings of assigned names: a string below each."""
+    told = {}
+    for statement, below in pairwise(body):
+        if isinstance(statement, ast.Assign) and isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant):
+            told[ast.unparse(statement.targets[0])] = plain(str(below.value.value))
+    return told
 
 
 def described(kind: inspect.Type) -> str:
@@ -142,7 +153,7 @@ def unit(name: str, kind: inspect.Type) -> str:
 
 
 def default(field: inspect.Field) -> str:
-    """Write the default of a field; nothing if it is required."""
+    """Write the default of a field, or that it is required."""
     if field.required:
         return "required"
     value: Any = UNSET  # a field that is left out has neither

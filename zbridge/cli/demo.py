@@ -191,9 +191,11 @@ def _left_out(error: ZbridgeError) -> str:
 def _is_whole(name: str) -> bool:
     """Return whether a protocol can be loaded, and what its robots need is installed; print what is missing."""
     try:
-        if all(find_spec(module) is not None for module in find_protocol(name).requires):
+        missing = [module for module in find_protocol(name).requires if find_spec(module) is None]
+        if not missing:
             return True
-        _left_out(ConfigError(f"{name}: pip install 'zbridge[{name}]' installs what its robots need"))
+        how = f"for a protocol of zbridge: pip install 'zbridge[{name}]'"
+        _left_out(ConfigError(f"{name}: not installed: {', '.join(missing)}; {how}"))
     except ConfigError as error:
         _left_out(error)
     return False

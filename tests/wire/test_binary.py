@@ -1,7 +1,7 @@
 """The binary codec, beyond the messages of the protocols: counts that lie, arrays, what cannot be written."""
 
 import math
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -10,7 +10,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zbridge.errors import EncodeError, ProtocolError
-from zbridge.wire import F32, F64, I16, I32, U8, U32, BinaryCodec, Blob, Bool, F32Array, I64Fill, Message, Text
+from zbridge.wire import (
+    F32,
+    F64,
+    I16,
+    I32,
+    U8,
+    U16,
+    U32,
+    BinaryCodec,
+    Blob,
+    Bool,
+    Counted,
+    F32Array,
+    I64Fill,
+    Message,
+    Rest,
+    Text,
+)
 
 
 class Fixed(Message, frozen=True):
@@ -29,6 +46,28 @@ class BigEndian(Message, frozen=True):
     byte_order = ">"
     velocity: I16
     radius: I16
+
+
+class Pair(Message, frozen=True):
+    number: U8
+    range_mm: U16
+
+    def check(self) -> None:
+        if self.number == 13:
+            raise ProtocolError("number is 13")
+
+
+class Grouped(Message, frozen=True):
+    kind: U8
+    pairs: Annotated[tuple[Pair, ...], Counted("B")]
+    behind: I16
+
+
+class BigEndianGrouped(Message, frozen=True):
+    byte_order = ">"
+    pairs: Annotated[tuple[Pair, ...], Counted("H")]
+    floats: F32Array
+    rest: Rest
 
 
 class Mixed(Message, frozen=True):
@@ -134,9 +173,14 @@ def test_a_value_the_wire_type_cannot_carry_is_an_encode_error(message: Message)
 @pytest.mark.parametrize(
     ("fields", "more", "what"),
     [
-        ([("number", int)], {}, "number: <class 'int'> is no wire type"),
+        ([("number", int)], {}, "Declared.number: <class 'int'> is no wire type; expected one of zbridge.wire"),
+        ([("pairs", Annotated[list[Pair], Counted("B")])], {}, r"Declared.pairs: list\[.*Pair\]; Counted expects"),
+        (
+            [("pairs", Annotated[tuple[Mixed, ...], Counted("B")])],
+            {},
+            "Mixed: a group that repeats has fields of fixed",
+        ),
         ([("first", Blob | None, None), ("second", Blob | None, None)], {}, "only the last field"),
-        ([("text", Text)], {"namespace": {"byte_order": ">"}}, "fixed width"),
         ([("points", I64Fill), ("name", Text)], {}, "points: only fields of fixed width may follow"),
         ([("value", U8)], {"kw_only": True}, "Declared: fields are given by position"),
     ],
@@ -154,3 +198,37 @@ def test_random_bytes_give_a_message_or_a_protocol_error(data: bytes, start: int
         except ProtocolError:
             continue
         assert isinstance(message, declared)
+
+
+def test_a_group_that_repeats_is_read_and_written_behind_its_count() -> None:
+    codec = BinaryCodec(Grouped)
+    whole = bytes.fromhex("07 02 00e803 05ffff feff")
+    message = Grouped(7, (Pair(0, 1000), Pair(5, 65535)), -2)
+    assert codec.decode(whole, 0) == message
+    assert codec.encode(message) == whole
+    assert codec.decode(bytes.fromhex("070001 00"), 0) == Grouped(7, (), 1)
+    for wrong, why in (
+        ("07 03 00e803 05ffff feff", "count 3 does not fit the 8 bytes that follow"),
+        ("07 01 00e803 05ffff feff", "3 bytes too many"),
+        ("07 01 0de803 feff", "number is 13"),
+    ):
+        with pytest.raises(ProtocolError, match=why):
+            codec.decode(bytes.fromhex(wrong), 0)
+    for unwritable in (Grouped(7, (Pair(0, 65536),), 0), Grouped(7, (None,), 0), Grouped(7, (Pair(0, 0),) * 256, 0)):
+        with pytest.raises(EncodeError, match="Grouped.pairs"):
+            codec.encode(unwritable)
+
+
+def test_every_field_of_a_big_endian_message_is_big_endian() -> None:
+    codec = BinaryCodec(BigEndianGrouped)
+    whole = bytes.fromhex("0001 0503e8 00000001 3f800000 0102")
+    message = codec.decode(whole, 0)
+    assert (message.pairs, message.floats.tolist(), message.rest) == ((Pair(5, 1000),), [1.0], b"\x01\x02")
+    assert codec.encode(message) == whole
+
+
+def test_a_value_that_does_not_fit_names_class_values_and_widths() -> None:
+    with pytest.raises(
+        EncodeError, match=r"BigEndian\(velocity=40000, radius=0\): .*; expected velocity: h, radius: h"
+    ):
+        BinaryCodec(BigEndian).encode(BigEndian(40000, 0))

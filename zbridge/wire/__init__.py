@@ -1,7 +1,8 @@
 """Legacy messages as bytes: one declaration a message, compiled to a binary or a text codec; frames cut from a stream.
 
 Sans-IO. Knows no protocol: a protocol declares its messages in its own package. ``fields`` has the wire types of
-declarations, ``binary`` and ``text`` the codecs, ``frames`` the bounded buffer of an incomplete frame.
+declarations, ``binary`` and ``text`` the codecs, ``lines`` and ``packets`` whole framings of lines of text and of
+packets with a head, a count and a checksum, ``frames`` the bounded buffer of an incomplete frame.
 """
 
 from zbridge.wire.binary import BinaryCodec
@@ -16,6 +17,7 @@ from zbridge.wire.fields import (
     U32,
     Blob,
     Bool,
+    Counted,
     Decimal,
     F32Array,
     F64Fill,
@@ -28,6 +30,7 @@ from zbridge.wire.fields import (
 )
 from zbridge.wire.frames import FrameBuffer
 from zbridge.wire.lines import Line, Lines
+from zbridge.wire.packets import Packets
 from zbridge.wire.text import TextCodec
 
 __all__ = [
@@ -42,6 +45,7 @@ __all__ = [
     "BinaryCodec",
     "Blob",
     "Bool",
+    "Counted",
     "Decimal",
     "F32Array",
     "F64Fill",
@@ -50,6 +54,7 @@ __all__ = [
     "Line",
     "Lines",
     "Message",
+    "Packets",
     "Rest",
     "Scalar",
     "Text",

@@ -1,6 +1,6 @@
 """The binary codec: a message declaration compiled once into functions between bytes and message. Sans-IO.
 
-Little endian; a message of fields of fixed width can be big-endian.
+Little endian, or big-endian where the message says so.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from zbridge.wire.fields import (
     CountedText,
     Field,
     Filling,
+    Groups,
     Message,
     Remainder,
     Scalar,
@@ -51,9 +52,8 @@ class BinaryCodec(Generic[M]):
         if any(field.optional for field in fields[:-1]):
             raise TypeError(f"{message.__name__}: only the last field may be missing")
         if scalars is None:
-            if message.byte_order != "<":
-                raise TypeError(f"{message.__name__}: only fields of fixed width can be big-endian")
-            self._steps = [(field, *_coders(field, fields[place + 1 :])) for place, field in enumerate(fields)]
+            order = message.byte_order
+            self._steps = [(field, *_coders(field, fields[place + 1 :], order)) for place, field in enumerate(fields)]
             self.decode, self.encode = self._decode_steps, self._encode_steps
         else:
             self._fixed = struct.Struct(message.byte_order + scalars)
@@ -66,7 +66,7 @@ class BinaryCodec(Generic[M]):
         try:
             return self._fixed.pack(*values)
         except (struct.error, OverflowError) as error:
-            raise EncodeError(f"{self.message.__name__} {values}: {error}") from error
+            raise EncodeError(f"{message!r}: {error}; expected {_expected(self.message)}") from error
 
     def _decode_steps(self, data: bytes, start: int) -> M:
         values = []
@@ -98,14 +98,20 @@ class BinaryCodec(Generic[M]):
         return b"".join(parts)
 
 
-def _coders(field: Field, behind: Sequence[Field]) -> tuple[Decode, Encode]:
+def _expected(message: type[Message]) -> str:
+    """Name the fields of a message, all of fixed width, with the codes of their widths."""
+    fields = declared_fields(message)
+    return ", ".join(f"{field.name}: {field.wire.code}" for field in fields if isinstance(field.wire, Scalar))
+
+
+def _coders(field: Field, behind: Sequence[Field], order: str) -> tuple[Decode, Encode]:
     """Return how one field of a message of variable length is read and written."""
     if not isinstance(field.wire, Filling):
-        return _CODERS[type(field.wire)](field.wire)
+        return _CODERS[type(field.wire)](field.wire, order)
     scalars = _all_scalars(behind)
     if scalars is None:
         raise TypeError(f"{field.name}: only fields of fixed width may follow it")
-    return _filling(field.wire, struct.calcsize("<" + scalars))
+    return _filling(field.wire, order, struct.calcsize("<" + scalars))
 
 
 def _all_scalars(fields: Sequence[Field]) -> str | None:
@@ -128,8 +134,8 @@ def _fixed_decoder(message: type[M], layout: struct.Struct) -> Callable[[bytes, 
     return decode
 
 
-def _scalar(wire: Scalar) -> tuple[Decode, Encode]:
-    layout = struct.Struct("<" + wire.code)
+def _scalar(wire: Scalar, order: str) -> tuple[Decode, Encode]:
+    layout = struct.Struct(order + wire.code)
 
     def decode(data: bytes, position: int) -> tuple[Any, int]:
         return layout.unpack_from(data, position)[0], position + layout.size
@@ -137,8 +143,10 @@ def _scalar(wire: Scalar) -> tuple[Decode, Encode]:
     return decode, layout.pack
 
 
-def _counted(count_code: str, item_size: int) -> tuple[Callable[[bytes, int], tuple[int, int]], struct.Struct]:
-    count = struct.Struct("<" + count_code)
+def _counted(
+    count_code: str, order: str, item_size: int
+) -> tuple[Callable[[bytes, int], tuple[int, int]], struct.Struct]:
+    count = struct.Struct(order + count_code)
 
     def span(data: bytes, position: int) -> tuple[int, int]:
         (items,) = count.unpack_from(data, position)
@@ -150,8 +158,8 @@ def _counted(count_code: str, item_size: int) -> tuple[Callable[[bytes, int], tu
     return span, count
 
 
-def _counted_bytes(wire: CountedBytes) -> tuple[Decode, Encode]:
-    span, count = _counted(wire.count_code, 1)
+def _counted_bytes(wire: CountedBytes, order: str) -> tuple[Decode, Encode]:
+    span, count = _counted(wire.count_code, order, 1)
 
     def decode(data: bytes, position: int) -> tuple[bytes, int]:
         first, end = span(data, position)
@@ -163,8 +171,8 @@ def _counted_bytes(wire: CountedBytes) -> tuple[Decode, Encode]:
     return decode, encode
 
 
-def _counted_text(wire: CountedText) -> tuple[Decode, Encode]:
-    decode_bytes, encode_bytes = _counted_bytes(CountedBytes(wire.count_code))
+def _counted_text(wire: CountedText, order: str) -> tuple[Decode, Encode]:
+    decode_bytes, encode_bytes = _counted_bytes(CountedBytes(wire.count_code), order)
 
     def decode(data: bytes, position: int) -> tuple[str, int]:
         raw, end = decode_bytes(data, position)
@@ -177,9 +185,9 @@ def _counted_text(wire: CountedText) -> tuple[Decode, Encode]:
     return decode, encode
 
 
-def _counted_array(wire: CountedArray) -> tuple[Decode, Encode]:
-    dtype, item_size = wire.dtype, _item_size(wire.dtype)
-    span, count = _counted(wire.count_code, item_size)
+def _counted_array(wire: CountedArray, order: str) -> tuple[Decode, Encode]:
+    dtype, item_size = wire.dtype.replace("<", order), _item_size(wire.dtype)
+    span, count = _counted(wire.count_code, order, item_size)
 
     def decode(data: bytes, position: int) -> tuple[Any, int]:
         import numpy as np
@@ -195,8 +203,31 @@ def _counted_array(wire: CountedArray) -> tuple[Decode, Encode]:
     return decode, encode
 
 
-def _filling(wire: Filling, behind: int) -> tuple[Decode, Encode]:
-    dtype, item_size = wire.dtype, _item_size(wire.dtype)
+def _groups(wire: Groups, order: str) -> tuple[Decode, Encode]:
+    scalars = _all_scalars(declared_fields(wire.item))
+    if scalars is None:
+        raise TypeError(f"{wire.item.__qualname__}: a group that repeats has fields of fixed width only")
+    item, layout, checks = wire.item, struct.Struct(order + scalars), wire.item.check is not Message.check
+    span, count = _counted(wire.count_code, order, layout.size)
+    names = [field.name for field in declared_fields(item)]
+
+    def decode(data: bytes, position: int) -> tuple[Any, int]:
+        first, end = span(data, position)
+        items = tuple(item(*values) for values in layout.iter_unpack(data[first:end]))
+        if checks:
+            for each in items:
+                each.check()
+        return items, end
+
+    def encode(value: Sequence[Message]) -> bytes:
+        packed = [layout.pack(*(getattr(each, name) for name in names)) for each in value]
+        return count.pack(len(packed)) + b"".join(packed)
+
+    return decode, encode
+
+
+def _filling(wire: Filling, order: str, behind: int) -> tuple[Decode, Encode]:
+    dtype, item_size = wire.dtype.replace("<", order), _item_size(wire.dtype)
 
     def decode(data: bytes, position: int) -> tuple[Any, int]:
         import numpy as np
@@ -220,14 +251,15 @@ def _item_size(dtype: str) -> int:
     return int(dtype[-1])
 
 
-def _remainder(wire: Remainder) -> tuple[Decode, Encode]:
+def _remainder(wire: Remainder, order: str) -> tuple[Decode, Encode]:
     return (lambda data, position: (data[position:], len(data))), bytes
 
 
-_CODERS: dict[type[Any], Callable[[Any], tuple[Decode, Encode]]] = {
+_CODERS: dict[type[Any], Callable[[Any, str], tuple[Decode, Encode]]] = {
     Scalar: _scalar,
     CountedText: _counted_text,
     CountedBytes: _counted_bytes,
     CountedArray: _counted_array,
+    Groups: _groups,
     Remainder: _remainder,
 }

@@ -5,14 +5,15 @@
         y: F32
         heading_deg: F32
 
-The last field may be missing if it is declared ``Blob | None = None``. A message may define ``check()``, which raises
+The last field may be missing if it is declared ``Blob | None = None``. A group that repeats, behind its count, is a
+message in a message: ``sonars: Annotated[tuple[Sonar, ...], Counted("B")]``. A message may define ``check()``, which raises
 ProtocolError for decoded values that contradict each other. A field whose text form differs from its binary form names
 both: ``Annotated[float, Scalar("h"), Decimal()]``. Sans-IO; a codec makes the bytes.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, get_args, get_origin, get_type_hints
 
 import msgspec
 
@@ -20,7 +21,7 @@ import msgspec
 class Message(msgspec.Struct, frozen=True, gc=False):
     """A typed legacy value; its fields are declared with the wire types of this module.
 
-    ``byte_order = ">"``: its fields, all of fixed width, are big-endian in binary.
+    ``byte_order = ">"``: its fields are big-endian in binary.
     """
 
     byte_order: ClassVar[str] = "<"
@@ -48,7 +49,7 @@ class CountedBytes(msgspec.Struct, frozen=True):
 
 
 class CountedArray(msgspec.Struct, frozen=True):
-    """A count of items, then that many items of one little-endian dtype."""
+    """A count of items, then that many items of one dtype, written as for little-endian."""
 
     count_code: str
     dtype: str
@@ -58,8 +59,24 @@ class Remainder(msgspec.Struct, frozen=True):
     """All remaining bytes of the body."""
 
 
+class Counted(msgspec.Struct, frozen=True):
+    """A count of groups, then that many groups of fields; ``count_code`` is the count's :mod:`struct` character.
+
+    The annotated type is ``tuple[Item, ...]``, where ``Item`` is a :class:`Message` of fields of fixed width.
+    """
+
+    count_code: str
+
+
+class Groups(msgspec.Struct, frozen=True):
+    """What :class:`Counted` declares, with the message of one group."""
+
+    count_code: str
+    item: type[Message]
+
+
 class Filling(msgspec.Struct, frozen=True):
-    """Items of one little-endian dtype that fill the room the other fields leave."""
+    """Items of one dtype, written as for little-endian, that fill the room the other fields leave."""
 
     dtype: str
 
@@ -88,7 +105,7 @@ if TYPE_CHECKING:
 else:  # numpy is loaded when the first array comes
     Floats = Doubles = Ints = Any
 
-WireType = Scalar | CountedText | CountedBytes | CountedArray | Remainder | Filling
+WireType = Scalar | CountedText | CountedBytes | CountedArray | Groups | Remainder | Filling
 TextType = Whole | Decimal
 
 I8 = Annotated[int, Scalar("b")]
@@ -118,15 +135,29 @@ class Field(msgspec.Struct, frozen=True):
 
 
 def declared_fields(message: type[Message]) -> list[Field]:
-    """Return the fields of a declaration; raise TypeError if one has no wire type."""
+    """Return the fields of a declaration; raise TypeError that names class and field if one has no wire type."""
     hints = get_type_hints(message, include_extras=True)
-    return [_field(field.name, hints[field.name]) for field in msgspec.structs.fields(message)]
+    return [_field(message, field.name, hints[field.name]) for field in msgspec.structs.fields(message)]
 
 
-def _field(name: str, hint: Any) -> Field:
+def _field(message: type[Message], name: str, hint: Any) -> Field:
     extras = [extra for candidate in (hint, *get_args(hint)) for extra in getattr(candidate, "__metadata__", ())]
     wire = next((extra for extra in extras if isinstance(extra, WireType)), None)
+    counted = next((extra for extra in extras if isinstance(extra, Counted)), None)
+    if counted is not None:
+        wire = Groups(counted.count_code, _item(f"{message.__qualname__}.{name}", get_args(hint)[0]))
     if wire is None:
-        raise TypeError(f"{name}: {hint} is no wire type")
+        raise TypeError(
+            f"{message.__qualname__}.{name}: {hint} is no wire type; expected one of zbridge.wire, as U8, or "
+            f'Annotated[int, Scalar("B")]'
+        )
     text = next((extra for extra in extras if isinstance(extra, TextType)), None)
     return Field(name, wire, text, optional=type(None) in get_args(hint))
+
+
+def _item(where: str, hint: Any) -> type[Message]:
+    """Return the message of one group, of ``tuple[Item, ...]``."""
+    item = next(iter(get_args(hint)), None)
+    if get_origin(hint) is tuple and isinstance(item, type) and issubclass(item, Message):
+        return item
+    raise TypeError(f"{where}: {hint}; Counted expects tuple[Item, ...], where Item is a Message")

@@ -100,8 +100,10 @@ class FrameBuffer:
                 if start == len(data):
                     return
             else:
-                start -= len(joined) - end
                 yield joined[:end]
+                behind, start = start, start - (len(joined) - end)
+                if start < 0:  # noise that ended within an earlier read
+                    data, start = joined[end:] + data[behind:], 0
         size = len(data)
         while start < size:
             end = self._end(data, start)

@@ -79,7 +79,7 @@ def test_only_the_damaged_packet_is_lost(sent: list[bytes], seed: int, damage: s
     rng = random.Random(seed)
     hit = rng.randrange(len(sent))
     damaged = PACKETS.packet(sent[hit])
-    place = rng.randrange(len(damaged))
+    place = rng.randrange(1, len(damaged))
     damaged = {
         "changed": damaged[:place] + bytes([damaged[place] ^ rng.randint(1, 255)]) + damaged[place + 1 :],
         "cut short": damaged[:place],

@@ -23,6 +23,7 @@ from zbridge.control.authority import Authority
 from zbridge.control.context import RobotContext
 from zbridge.control.events import CommandSender, EventKind
 from zbridge.control.latch import Latches, LatchRecord, read_stop
+from zbridge.control.lease_hook import LeaseHook
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import Standstill
 from zbridge.errors import Refused, Stale
@@ -62,6 +63,7 @@ class Enforcer:
         """Writings of latched stops that have not ended."""
         self.admission = CommandFilter(authority, context.keys, context.clock)
         """Sorts commands on the bus's threads."""
+        self.lease_hook = LeaseHook(context, authority)
         self._context = context
         self._clock = context.clock
         self._suspended_s = context.suspended_s()
@@ -251,6 +253,7 @@ class Enforcer:
                 if event.what in (EventKind.LATCHED, EventKind.UNLATCHED):
                     self._save_latches()
                 self._audit.write(event)
+            self.lease_hook.tell()
             if self._control_due is None and not self._closed:
                 self._control_due = self._loop.call_later(_CONTROL_S, self.report)
         if changed:

@@ -7,20 +7,24 @@ event loop, socket, clock, bus, and no robot in particular.
 plugin          :class:`Protocol`: what an entry point names. :class:`RobotSide` and :class:`HqSide`: its sides, with
                 :class:`Outcome`, :data:`Telemetry`, :data:`Translate` and :data:`Send`; :class:`RobotUser`: what a
                 side may do for a client every ``ATTEND_S`` seconds.
-                :class:`Simulation`, :class:`HqSimulation`: how its simulators are started. :class:`Codec`: the
-                messages, for the conformance kit. :class:`Advice`: what ``zbridge doctor`` says of a robot.
+                :class:`Simulation`, :class:`HqSimulation`: how its simulators are started; :class:`Truth`: what a
+                simulated robot reports to the conformance kit. :class:`Codec`: the messages, for the kit;
+                :class:`Example`: bytes from the maker's manual. :class:`Advice`: what ``zbridge doctor`` says.
 session         :class:`Session`: one conversation, in a :class:`Role`, within :class:`Limits`, in a :class:`State`,
                 with its :class:`Traffic`; a :class:`Datagram` is a frame that goes by UDP, and a session with
                 :class:`SourceClaims` says which of them are its peer's.
+liveness        :class:`KeepAlive`: what a session repeats so that the robot's watchdog lets it move. A session watches
+                for the robot's silence itself (``Session.silent_s``, ``lost_s``).
 session_table   :class:`ClientIds`: the ids that a robot gives its clients.
-outbox          :class:`Outbox`: what a session still has to write; ``LIMIT`` frames may wait.
+outbox          :class:`Outbox`: what a session still has to write; ``LIMIT`` frames may wait. ``KEEP_ALIVE``: the slot
+                of a keep-alive.
 handshake       :class:`Handshake`: executes the table of a handshake, with the time limit of each step.
                 :func:`agree`, :func:`newest`, :func:`parse_versions`: which version both sides speak.
 device_clock    :class:`DeviceClock`: when a device measured, by its own millisecond counter.
 rate_limit      :class:`RateLimit`: how often something may happen.
 exchange        :class:`ExchangeSession`, :class:`Exchange`: a session that asks, awaits the answer and polls.
 kinematics      :class:`Differential`, :class:`Factors`: from drives to wheels, and back; :data:`Positive` for options.
-                :class:`Odometry`: from what the wheels have turned to a pose.
+                :class:`Odometry`: from the robot's own counters to a pose.
 kept            :class:`Kept`: what survives a restart of the gateway, as :class:`Exported`; :class:`Form`, ``FRAME``,
                 ``FRAMES`` for what no type describes; :class:`Spare`: what may be left out where it is large;
                 :class:`Frame`: a frame of a kind of its own.
@@ -54,11 +58,13 @@ from zbridge.protocol.exchange import Exchange, ExchangeSession
 from zbridge.protocol.handshake import Handshake, agree, newest, parse_versions
 from zbridge.protocol.kept import FRAME, FRAMES, Exported, Form, Frame, Kept, Spare
 from zbridge.protocol.kinematics import Differential, Factors, Odometry, Positive
-from zbridge.protocol.outbox import LIMIT, Outbox
+from zbridge.protocol.liveness import KeepAlive
+from zbridge.protocol.outbox import KEEP_ALIVE, LIMIT, Outbox
 from zbridge.protocol.plugin import (
     ATTEND_S,
     Advice,
     Codec,
+    Example,
     HqSide,
     HqSimulation,
     Outcome,
@@ -69,6 +75,7 @@ from zbridge.protocol.plugin import (
     Simulation,
     Telemetry,
     Translate,
+    Truth,
 )
 from zbridge.protocol.rate_limit import RateLimit
 from zbridge.protocol.samples import (
@@ -88,6 +95,7 @@ __all__ = [
     "ATTEND_S",
     "FRAME",
     "FRAMES",
+    "KEEP_ALIVE",
     "LIMIT",
     "SAMPLE_BYTES",
     "Address",
@@ -102,6 +110,7 @@ __all__ = [
     "DeviceClock",
     "Differential",
     "EncodeError",
+    "Example",
     "Exchange",
     "ExchangeSession",
     "Exported",
@@ -111,6 +120,7 @@ __all__ = [
     "Handshake",
     "HqSide",
     "HqSimulation",
+    "KeepAlive",
     "Kept",
     "KeyedSample",
     "Limits",
@@ -139,6 +149,7 @@ __all__ = [
     "Telemetry",
     "Traffic",
     "Translate",
+    "Truth",
     "Unsupported",
     "agree",
     "newest",

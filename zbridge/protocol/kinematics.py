@@ -7,12 +7,13 @@ takes speeds. The classes are tables of a configuration too: a protocol's option
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from typing import Annotated, Any, ClassVar
 
 import msgspec
 
 from zbridge.errors import Unsupported
 from zbridge.fleet.messages import Drive, Pose
+from zbridge.protocol.kept import Kept
 
 Positive = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
 Factor = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
@@ -69,27 +70,40 @@ class Factors(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return drive.forward * self.forward + drive.left * self.left + drive.turn * self.turn
 
 
-class Odometry:
-    """A pose that begins at the origin, heading along x. ``track_m``: between the two sides of wheels."""
+class Odometry(Kept):
+    """A pose that begins at the origin, heading along x, from what a robot counts itself.
 
-    def __init__(self, track_m: float) -> None:
-        self._track_m = track_m
-        self._sides_m: tuple[float, float] | None = None
+    track_m: between the two sides of wheels; :meth:`sides` alone needs it. unit_m: metres of one unit of the robot's
+    counters. wrap: the number of values of a counter (``2**16``), after which it begins anew; None: it never does.
+    """
+
+    kept: ClassVar[dict[str, Any]] = {"_x": float, "_y": float, "_heading": float, "_counted": tuple[float, ...] | None}
+
+    def __init__(self, track_m: float = math.inf, *, unit_m: float = 1.0, wrap: float | None = None) -> None:
+        self._track_m, self._unit_m, self._wrap = track_m, unit_m, wrap
+        self._counted: tuple[float, ...] | None = None
         self._x = self._y = self._heading = 0.0
 
     def __repr__(self) -> str:
         return f"<Odometry x={self._x:.3f} y={self._y:.3f} heading={self._heading:.3f}>"
 
     def restart(self) -> None:
-        """Treat the next positions as those of the current pose: the robot's counters may have been reset."""
-        self._sides_m = None
+        """Treat the next counters as those of the current pose: the robot may have reset them."""
+        self._counted = None
 
-    def sides(self, left_m: float, right_m: float, stamp_ns: int) -> Pose:
-        """Return the pose for the distances that the two sides have covered since their counters began, metres."""
-        left_before, right_before = self._sides_m or (left_m, right_m)
-        self._sides_m = (left_m, right_m)
-        left, right = left_m - left_before, right_m - right_before
-        return self.moved((left + right) / 2, (right - left) / self._track_m, stamp_ns)
+    def sides(self, left: float, right: float, stamp_ns: int) -> Pose:
+        """Return the pose for the distances that the two sides have covered since their counters began, in units."""
+        left_before, right_before = self._since((left, right))
+        left_m, right_m = self._way_m(left, left_before), self._way_m(right, right_before)
+        return self.moved((left_m + right_m) / 2, (right_m - left_m) / self._track_m, stamp_ns)
+
+    def placed(self, x: float, y: float, heading_rad: float, stamp_ns: int) -> Pose:
+        """Return the pose of a robot that reckons its own: ``x``, ``y`` in units, on its own axes."""
+        x_before, y_before, heading_before = self._since((x, y, heading_rad))
+        x_m, y_m, axes_rad = self._way_m(x, x_before), self._way_m(y, y_before), self._heading - heading_before
+        self._x += x_m * math.cos(axes_rad) - y_m * math.sin(axes_rad)
+        self._y += x_m * math.sin(axes_rad) + y_m * math.cos(axes_rad)
+        return self.moved(0.0, math.remainder(heading_rad - heading_before, 2 * math.pi), stamp_ns)
 
     def moved(self, way_m: float, turned_rad: float, stamp_ns: int) -> Pose:
         """Return the pose after a path of ``way_m`` on which the robot turned by ``turned_rad``, counter-clockwise."""
@@ -98,3 +112,13 @@ class Odometry:
         self._y += way_m * math.sin(along)
         self._heading = math.remainder(self._heading + turned_rad, 2 * math.pi)
         return Pose(self._x, self._y, self._heading, stamp_ns=stamp_ns)
+
+    def _since(self, counted: tuple[float, ...]) -> tuple[float, ...]:
+        """Note what is counted now; return what was before, the same where the counters begin."""
+        before, self._counted = self._counted or counted, counted
+        return before
+
+    def _way_m(self, counter: float, before: float) -> float:
+        """Return the distance between two values of a counter, the shorter way where it wraps."""
+        way = counter - before
+        return (way if self._wrap is None else math.remainder(way, self._wrap)) * self._unit_m

@@ -19,6 +19,8 @@ Fairness: the slot that has been due longest goes first; slots and queue take tu
 a stream of motion nor a full queue starves the other. A group that replaces one of the same length continues at the
 position of the old one: if a group of motors is replaced faster than it is written, each motor is still served.
 
+The slot :data:`KEEP_ALIVE` is sent while the outbox is muted, too, and nothing but :meth:`Outbox.clear` empties it.
+
 Bounds: queue and exempt refuse a frame beyond ``limit``; urgent keeps the newest ``URGENT`` frames; a slot holds one
 group, and a protocol names a fixed number of slots.
 """
@@ -36,6 +38,8 @@ from zbridge.protocol.kept import FRAMES, Form, Kept, Spare
 
 URGENT = 256
 """Frames of stops that may wait: one for each motor that a robot can have."""
+KEEP_ALIVE = "keep alive"
+"""The slot of what the robot's watchdog needs."""
 LIMIT = 64
 """Frames that may wait; one more is refused."""
 
@@ -116,11 +120,12 @@ class Outbox(Kept):
         self._quiet_until = until
 
     def mute(self, muted: bool) -> None:
-        """Drop all frames but exempt ones, waiting or new, until ``mute(False)``."""
+        """Drop all frames but exempt ones and the keep-alive, waiting or new, until ``mute(False)``."""
         self._muted = muted
         if muted:
-            for place in (self._queue, self._urgent, self._slots):
+            for place in (self._queue, self._urgent):
                 place.clear()
+            self._clear_slots()
 
     def put_exempt(self, frame: bytes) -> None:
         """Queue a frame that leaves first, and during a silence; raise Refused when ``limit`` of them wait."""
@@ -157,7 +162,7 @@ class Outbox(Kept):
         ``urgent``: queue it before all slots, to leave whole; the slot holds its repetitions, none if ``until`` is not
         after ``now``.
         """
-        if self._muted:
+        if self._muted and slot != KEEP_ALIVE:
             return
         old = self._slots.get(slot)
         new = self._slots[slot] = _Group(frames, now, period_s, until, spacing_s)
@@ -183,8 +188,12 @@ class Outbox(Kept):
 
     def forget(self) -> None:
         """Drop every waiting frame, and every repetition."""
-        for place in (self._queue, self._urgent, self._exempt, self._slots):
+        for place in (self._queue, self._urgent, self._exempt):
             place.clear()
+        self._clear_slots()
+
+    def _clear_slots(self) -> None:
+        self._slots = {slot: group for slot, group in self._slots.items() if slot == KEEP_ALIVE}
 
     def clear(self, slot: str) -> None:
         """Empty ``slot``."""

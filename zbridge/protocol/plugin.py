@@ -25,7 +25,11 @@ from zbridge.protocol.entry_points import entry_points, find_entry_point
 from zbridge.protocol.kept import Kept
 from zbridge.protocol.session import Limits, Session, State
 from zbridge.protocol.session_table import ClientIds
-from zbridge.wire.frames import FrameEnd
+from zbridge.protocol.trial import Codec as Codec
+from zbridge.protocol.trial import Example as Example
+from zbridge.protocol.trial import HqSimulation as HqSimulation
+from zbridge.protocol.trial import Simulation as Simulation
+from zbridge.protocol.trial import Truth as Truth
 
 GROUP = "zbridge.protocols"
 
@@ -120,6 +124,15 @@ class RobotSide(Kept, ABC):
     def listened(self, topic: Topic, on: bool) -> None:
         """Switch an on-demand topic: the first subscriber appeared (``on``), or the last one left. Raise Refused."""
         raise Unsupported(f"{topic.path} needs no listener")
+
+    def leased(self, on: bool, now: float) -> None:
+        """Prepare the robot for a driver (``on``), or put it to rest, as by switching its motors. Raise Refused.
+
+        Called when a program takes the lease, when nobody has it any more (the stop goes first), and after each
+        connection is established, with what holds then. A lease that passes from one program to another changes
+        nothing.
+        """
+        return
 
     def begun(self, stamp_ns: int) -> tuple[Telemetry, ...]:
         """Start with a newly established connection; return the telemetry that is known at once."""
@@ -235,49 +248,6 @@ class HqSide(Kept, ABC):
         return
 
 
-class HqSimulation(msgspec.Struct, frozen=True):
-    """The start options of a simulated HQ program. It is as fragile as legacy ones. ``address``: where it connects.
-
-    ``drive``: forward and turn that it drives once it has sent neutral, fractions of full scale; None: none.
-    """
-
-    address: Address
-    version: str | None = None
-    dialect: str | None = None
-    udp: bool = False
-    drive: tuple[float, float] | None = None
-
-
-class Simulation(msgspec.Struct, frozen=True):
-    """The start options of a simulated robot. ``addresses``: where it listens, one for each link, in the links' order.
-
-    ``ready`` is called with the bound addresses. A protocol raises ConfigError for what it does not support (versions,
-    dialects, datagrams, a second link).
-    """
-
-    addresses: tuple[Address, ...]
-    seed: int = 1
-    version: str | None = None
-    dialect: str | None = None
-    udp: bool = False
-    fragile: bool = False
-    ready: Callable[[tuple[Address, ...]], None] = lambda addresses: None
-
-
-class Codec(msgspec.Struct, frozen=True):
-    """The messages that one side sends in one dialect, and how they are written, read and framed; for the kit.
-
-    write: returns one frame, raises EncodeError. read: decodes one frame, raises ProtocolError and nothing else.
-    messages: examples. A class stands for one example whose fields the kit fills in.
-    """
-
-    name: str
-    write: Callable[[Any], bytes]
-    read: Callable[[bytes], Any]
-    frame_end: FrameEnd
-    messages: tuple[Any, ...]
-
-
 class Advice(msgspec.Struct, frozen=True):
     """What is wrong with a robot, as its protocol knows it. code: for programs; text, remedy: for people.
 
@@ -328,6 +298,11 @@ class Protocol(msgspec.Struct, frozen=True):
     """Modules that its robots need beyond what zbridge itself does; an extra installs them."""
     advice: tuple[Advice, ...] = ()
     """What its robots are known to suffer from, for ``zbridge doctor``."""
+    examples: tuple[Example, ...] = ()
+    """Bytes from the maker's manual, for the conformance kit."""
+    plausible: dict[str, tuple[float, float]] = {}
+    """The least and the most that a healthy robot shows of a number, by path and field, in the bus's units:
+    ``{"battery.voltage": (9.0, 15.0), "sensor/sonar*.value": (0.0, 5.0)}``; ``*`` stands for anything."""
 
     def advise(self, reasons: Sequence[str]) -> tuple[Advice, ...]:
         """Return what is wrong with a robot. reasons: what ``status`` says, and why its last session ended."""

@@ -8,7 +8,8 @@ that were read and ``fail`` when the transport is gone. After each call it write
 and calls ``expire(now)`` at ``deadline()``.
 
 A protocol contributes the framing function, ``decode``, ``encode`` and the steps of its handshake: ``opened`` takes the
-first one, ``accept`` those that answer the peer, ``establish`` ends it. ``receive`` raises nothing: a frame with a
+first one, ``accept`` those that answer the peer, ``establish`` ends it; then the session repeats ``keep_alive`` and
+watches for a silence (``silent_s``, ``lost_s``), where its class sets them. ``receive`` raises nothing: a frame with a
 malformed body is skipped; what cannot be a frame, too many frames, or an answer that cannot be sent end the session.
 """
 
@@ -18,7 +19,6 @@ import math
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable
-from enum import Enum
 from typing import Any, ClassVar, Generic, TypeVar
 
 import msgspec
@@ -26,9 +26,12 @@ import msgspec
 from zbridge.errors import EncodeError, ProtocolError, Refused
 from zbridge.fleet.processes import SessionEntry
 from zbridge.protocol.kept import Budget, Exported, Kept
-from zbridge.protocol.outbox import Outbox
+from zbridge.protocol.liveness import KeepAlive as KeepAlive
+from zbridge.protocol.liveness import SilenceWatch
+from zbridge.protocol.outbox import KEEP_ALIVE, Outbox
 from zbridge.protocol.rate_limit import RateLimit
 from zbridge.protocol.session_states import TRANSITIONS, SessionEvent
+from zbridge.protocol.session_states import Role as Role
 from zbridge.protocol.session_states import State as State
 from zbridge.protocol.traffic import Datagram as Datagram
 from zbridge.protocol.traffic import Limits as Limits
@@ -52,13 +55,6 @@ SKIPPED = "the rest of a frame whose beginning was lost with a gateway"
 """What a session counts among what it left out."""
 
 
-class Role(Enum):
-    """The side of a legacy protocol that we play."""
-
-    HQ = "hq"
-    ROBOT = "robot"
-
-
 _ESTABLISHED, _CLOSING, _CLOSED = State.ESTABLISHED, State.CLOSING, State.CLOSED
 """Every message is compared with these; looking them up in the class is slow in Python 3.11."""
 
@@ -80,11 +76,19 @@ class Session(Kept, ABC, Generic[M]):
         "outbox": Outbox,
         "_limit_at": float,
         "_allowance": RateLimit,
+        "silence": SilenceWatch,
     }
     role: Role
     frame_end: FrameEnd
     handled: frozenset[type] = frozenset()
     """Message classes that go to ``accept`` after the handshake too."""
+    silent_s: float | None = None
+    """Seconds without a message after which the robot is not driven; ``inf``: a healthy robot may be silent."""
+    lost_s: float | None = None
+    """Seconds without a message after which the session ends; None: it never ends for that."""
+    keep_alive: KeepAlive | None = None
+    """What the robot's watchdog needs. It leaves only while this process works, so the watchdog stops a robot whose
+    gateway hangs."""
 
     def __init__(self, limits: Limits, *, name: str = "", peer: str = "") -> None:
         self.limits = limits
@@ -107,6 +111,9 @@ class Session(Kept, ABC, Generic[M]):
         self._frames = FrameBuffer(self.frame_end, limits.frame_bytes)
         self._limit_at = math.inf
         self._allowance = RateLimit(limits.rate_hz)
+        self.silence = SilenceWatch(self.silent_s, self.lost_s)
+        self._now = -math.inf
+        """The time of the last call that may establish the session."""
 
     def __repr__(self) -> str:
         reason = f" ({self.reason})" if self.reason else ""
@@ -158,6 +165,7 @@ class Session(Kept, ABC, Generic[M]):
             return messages
         traffic, decode, tap, handled = self.traffic, self.decode, self.tap, self.handled
         traffic.bytes_in += len(data)
+        malformed, self._now = traffic.malformed, now
         frames, allowed = 0, self._allowance.fill(now) if self._allowance.rate_hz < math.inf else math.inf
         try:
             for frame in self._frames.feed(data):
@@ -169,10 +177,7 @@ class Session(Kept, ABC, Generic[M]):
                     tap("in", frame)
                 try:
                     message = decode(frame)
-                    if established and type(message) not in handled:
-                        messages.append(message)
-                        continue
-                    if self.accept(message, now):
+                    if (established and type(message) not in handled) or self.accept(message, now):
                         messages.append(message)
                 except ProtocolError as error:
                     self.malformed(str(error))
@@ -186,6 +191,8 @@ class Session(Kept, ABC, Generic[M]):
             self.fail(f"broken stream: {error}")
         traffic.frames_in += frames
         self._allowance.left -= frames
+        if self.silence.on and frames > traffic.malformed - malformed:
+            self._heard(now)
         return messages
 
     def receive_datagram(self, datagram: bytes, now: float) -> list[M]:
@@ -204,6 +211,7 @@ class Session(Kept, ABC, Generic[M]):
             if end != len(datagram):
                 raise ProtocolError(f"datagram of {len(datagram)} bytes holds a frame of {end}")
             message = self.decode(datagram)
+            self._heard(now)
             if self.accept_datagram(message, now):
                 return [message]
         except ProtocolError as error:
@@ -215,6 +223,11 @@ class Session(Kept, ABC, Generic[M]):
     def accept_datagram(self, message: M, now: float) -> bool:
         """Handle a message that came by datagram; True passes it on to the translator."""
         return self.accept(message, now)
+
+    def _heard(self, now: float) -> None:
+        """Note a sign of life of an established peer."""
+        if self.silence.on and self.state is _ESTABLISHED:
+            self.busy = self.silence.heard(now, self.busy)
 
     def _flooded(self) -> None:
         self.fail(f"flood: more than {self.limits.rate_hz:g} messages a second")
@@ -246,14 +259,19 @@ class Session(Kept, ABC, Generic[M]):
         if self.state is _CLOSED:
             return None
         outbox = self.outbox.deadline() if writing else None
-        timers = math.inf if self.state is _CLOSING else self.timers()
+        timers = math.inf if self.state is _CLOSING else min(self.timers(), self.silence.due)
         earliest = min(self._limit_at, timers, math.inf if outbox is None else outbox)
         return None if earliest == math.inf else earliest
 
     def expire(self, now: float) -> None:
         """Run the timers that are due."""
+        self._now = now
         if not self.over and now >= self.timers():
             self.on_timer(now)
+        if not self.over and now >= self.silence.due:
+            self.busy, lost = self.silence.judge(now, self.busy)
+            if lost is not None:
+                self.fail(lost)
         if now >= self._limit_at:
             self._limit_at = math.inf
             self._on(SessionEvent.OVERDUE, self.overdue())
@@ -350,8 +368,17 @@ class Session(Kept, ABC, Generic[M]):
 
 
 def _begin(session: Session[Any], reason: str, now: float) -> None:
-    session._limit_at = now + session.limits.handshake_s
+    session._limit_at, session._now = now + session.limits.handshake_s, now
     session.opened(now)
+
+
+def _agree(session: Session[Any], reason: str, now: float) -> None:
+    session.lift_limit()
+    keep_alive = session.keep_alive
+    if keep_alive is not None:
+        frames = (session.encode(keep_alive.message),)
+        session.outbox.set(KEEP_ALIVE, frames, session._now, period_s=keep_alive.period_s)
+    session._heard(session._now)
 
 
 def _leave(session: Session[Any], reason: str, now: float) -> None:
@@ -365,7 +392,7 @@ def _end(session: Session[Any], reason: str, now: float) -> None:
 
 _ACTIONS: dict[SessionEvent, Callable[[Session[Any], str, float], None]] = {
     SessionEvent.OPEN: _begin,
-    SessionEvent.AGREED: lambda session, reason, now: session.lift_limit(),
+    SessionEvent.AGREED: _agree,
     SessionEvent.CLOSE: _leave,
     SessionEvent.WRITTEN: _end,
     SessionEvent.OVERDUE: _end,

@@ -24,6 +24,13 @@ from __future__ import annotations
 from enum import Enum
 
 
+class Role(Enum):
+    """The side of a legacy protocol that we play."""
+
+    HQ = "hq"
+    ROBOT = "robot"
+
+
 class State(Enum):
     """The state of a session; it only ever moves down this list."""
 

@@ -56,6 +56,11 @@ class Body:
         self.blocked = False
 
     @classmethod
+    def placed(cls, place: tuple[float, float, float] | None, *, radius: float = 0.2) -> Body:
+        """Place a robot at (x, y, heading); None: at the origin, heading along x."""
+        return cls(*(place or (0.0, 0.0, 0.0)), radius)
+
+    @classmethod
     def somewhere(cls, rng: random.Random, *, heading: float = 0.0, radius: float = 0.2) -> Body:
         """Place a robot near the middle of the room, within 0.3 rad of ``heading``, as the seed says."""
         return cls(rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5), rng.uniform(-0.3, 0.3) + heading, radius)

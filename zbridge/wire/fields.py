@@ -6,9 +6,9 @@
         heading_deg: F32
 
 The last field may be missing if it is declared ``Blob | None = None``. A group that repeats, behind its count, is a
-message in a message: ``sonars: Annotated[tuple[Sonar, ...], Counted("B")]``. A message may define ``check()``, which raises
-ProtocolError for decoded values that contradict each other. A field whose text form differs from its binary form names
-both: ``Annotated[float, Scalar("h"), Decimal()]``. Sans-IO; a codec makes the bytes.
+message in a message: ``sonars: Annotated[tuple[Sonar, ...], Counted("B")]``. A message may define ``check()``, which
+raises ProtocolError for decoded values that contradict each other. A field whose text form differs from its binary form
+names both: ``Annotated[float, Scalar("h"), Decimal()]``. Sans-IO; a codec makes the bytes.
 """
 
 from __future__ import annotations

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import math
 
 import numpy as np
@@ -22,49 +21,67 @@ from khepera.messages import (
     SpeedsSet,
     Version,
 )
-from khepera.translate import BEARINGS_DEG, DISTANCE_M, LIGHT, PULSE_M, UNIT_M_S
-from zbridge.protocol import Address, ConfigError, ProtocolError, Simulation
+from khepera.translate import BEARINGS_DEG, DISTANCE_M, LIGHT, PULSE_M, UNIT_M_S, WRAP
+from zbridge.protocol import ProtocolError, Simulation, Truth
+from zbridge.simulation import SimulatedRobot, serve
 from zbridge.simulation.world import Body, cast
-from zbridge.wire import Line
+from zbridge.wire import FrameBuffer, Line
 
-STEP_S = 0.01
 SILENCE_S = 1.0
 """Seconds without a request after which it stops."""
 TRACK_M, RADIUS_M = 0.053, 0.0275
+LONGEST = 128
 _ANGLES = np.radians(list(BEARINGS_DEG.values()))
+_STILL = SetSpeeds(0, 0)
 
 
-class Khepera:
-    """The robot, without a link."""
+class Khepera(SimulatedRobot):
+    """The robot, without a link. place: x, y, heading. at_wrap: its counters are about to begin anew."""
 
-    def __init__(self) -> None:
-        self.body = Body(radius=RADIUS_M)
-        self.speeds = SetSpeeds(0, 0)
+    def __init__(self, place: tuple[float, float, float] | None = None, *, at_wrap: bool = False) -> None:
+        self.body = Body.placed(place, radius=RADIUS_M)
+        self.speeds = _STILL
         self.leds: dict[int, bool] = {}
-        self._left_m = self._right_m = 0.0
+        self._pulses = [float(WRAP // 2 - 100 if at_wrap else 0)] * 2
+        self._lines = FrameBuffer(LINES.end, LONGEST)
         self._silent_s = 0.0
 
-    def answer(self, line: bytes) -> bytes:
-        """Carry out one line and return its answer, empty for a line that is no request."""
+    def connected(self) -> bytes:
+        self._lines = FrameBuffer(LINES.end, LONGEST)
+        return b""
+
+    def receive(self, data: bytes) -> bytes:
+        """Carry out every whole line, and return the answers; a line that is no request has none."""
+        return b"".join(map(self._answer, self._lines.feed(data)))
+
+    def step(self, dt: float) -> bytes:
+        self._silent_s += dt
+        if self._silent_s > SILENCE_S:
+            self.speeds = _STILL
+        left, right = self._speeds_m_s()
+        self._pulses[0] += left * dt / PULSE_M
+        self._pulses[1] += right * dt / PULSE_M
+        self.body.step((left + right) / 2, 0.0, (right - left) / TRACK_M, dt)
+        return b""
+
+    def truth(self) -> Truth:
+        wraps = sum(pulses >= WRAP // 2 for pulses in self._pulses)
+        neutral = self.speeds == _STILL
+        return Truth(self.body.x, self.body.y, self.body.heading, self._speeds_m_s(), neutral, wraps)
+
+    def _speeds_m_s(self) -> tuple[float, float]:
+        return self.speeds.left * UNIT_M_S, self.speeds.right * UNIT_M_S
+
+    def _answer(self, line: bytes) -> bytes:
         try:
             request = LINES.read(line)
         except ProtocolError:
             return b""
-        answer = self._answer(request)
+        answer = self._carry_out(request)
         self._silent_s = 0.0
         return b"" if answer is None else LINES.write(answer)
 
-    def step(self, dt: float) -> None:
-        """Advance by ``dt`` seconds."""
-        self._silent_s += dt
-        if self._silent_s > SILENCE_S:
-            self.speeds = SetSpeeds(0, 0)
-        left, right = self.speeds.left * UNIT_M_S, self.speeds.right * UNIT_M_S
-        self._left_m += left * dt
-        self._right_m += right * dt
-        self.body.step((left + right) / 2, 0.0, (right - left) / TRACK_M, dt)
-
-    def _answer(self, request: Line) -> Line | None:
+    def _carry_out(self, request: Line) -> Line | None:
         match request:
             case ReadVersion():
                 return Version(5, 1)
@@ -74,7 +91,7 @@ class Khepera:
             case ReadSpeeds():
                 return Speeds(self.speeds.left, self.speeds.right)
             case ReadPositions():
-                return Positions(round(self._left_m / PULSE_M), round(self._right_m / PULSE_M))
+                return Positions(*((round(pulses) + WRAP // 2) % WRAP - WRAP // 2 for pulses in self._pulses))
             case ReadProximity():
                 return self._proximity()
             case SetLed():
@@ -91,26 +108,4 @@ class Khepera:
 
 async def simulate(simulation: Simulation) -> None:
     """Serve one Khepera on a TCP port until cancelled."""
-    if simulation.version or simulation.dialect or simulation.udp or simulation.fragile:
-        raise ConfigError("a simulated Khepera has no versions, dialects, datagrams or fragile variant")
-    robot = Khepera()
-
-    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        try:
-            while line := await reader.readline():
-                writer.write(robot.answer(line))
-                await writer.drain()
-        except (ConnectionError, ValueError):  # disconnected, or a line without an end
-            pass
-        finally:
-            writer.close()
-
-    (address,) = simulation.addresses
-    async with await asyncio.start_server(serve, address.host, address.port) as server:
-        simulation.ready((Address(*server.sockets[0].getsockname()[:2]),))
-        clock = asyncio.get_running_loop().time
-        lived = clock()
-        while True:
-            await asyncio.sleep(STEP_S)
-            before, lived = lived, clock()
-            robot.step(lived - before)
+    await serve(simulation, Khepera(simulation.place, at_wrap=simulation.at_wrap))

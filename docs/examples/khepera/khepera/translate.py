@@ -12,7 +12,7 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Motion, Switch
 from zbridge.fleet.topics import Topic
 
-UNIT_M_S, MOST_UNITS, PULSE_M = 0.008, 127, 0.00008
+UNIT_M_S, MOST_UNITS, PULSE_M, WRAP = 0.008, 127, 0.00008, 2**32
 AGAIN_S, STOP_AGAIN_S = 0.5, 0.1
 BEARINGS_DEG = dict(zip(Proximity.__struct_fields__, (-150, -85, -45, -15, 15, 45, 85, 150), strict=True))
 RANGE_M = (0.005, 0.06)
@@ -36,7 +36,7 @@ class KheperaRobot(protocol.RobotSide):
         self.options = options
         self._session: KheperaSession | None = None
         self._scan = protocol.BearingScan(BEARINGS_DEG, RANGE_M)
-        self._odometry = protocol.Odometry(options.track_m)
+        self._odometry = protocol.Odometry(options.track_m, unit_m=PULSE_M, wrap=WRAP)
 
     def session(self, link: str, peer: str) -> KheperaSession:
         self._session = KheperaSession(protocol.Limits(frame_bytes=128, handshake_s=5.0))
@@ -54,8 +54,7 @@ class KheperaRobot(protocol.RobotSide):
         return found.get(kind, lambda message, stamp_ns: ())
 
     def _pose(self, message: Positions, stamp_ns: int) -> tuple[protocol.Telemetry, ...]:
-        pose = self._odometry.sides(message.left * PULSE_M, message.right * PULSE_M, stamp_ns)
-        return ((topics.POSE, pose),)
+        return ((topics.POSE, self._odometry.sides(message.left, message.right, stamp_ns)),)
 
     def _motion(self, message: Speeds, stamp_ns: int) -> tuple[protocol.Telemetry, ...]:
         speed = self.options.drive(message.left * UNIT_M_S, message.right * UNIT_M_S).forward

@@ -15,10 +15,11 @@ from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 from khepera.messages import SetSpeeds
-from khepera.simulator import STEP_S, Khepera
+from khepera.simulator import Khepera
 
 import zbridge
 from zbridge.errors import BusError, Refused
+from zbridge.simulation import STEP_S
 
 WAIT_S = 20.0
 
@@ -64,16 +65,14 @@ class SerialKhepera:
         os.close(self._near)
 
     def _live(self) -> None:
-        waiting, lived = b"", time.monotonic()
+        lived = time.monotonic()
         while not self._over.wait(STEP_S):
             before, lived = lived, time.monotonic()
             self.robot.step(lived - before)
             with contextlib.suppress(BlockingIOError):
-                waiting += os.read(self._far, 4096)
-            *lines, waiting = waiting.split(b"\n")
-            answers = [self.robot.answer(line + b"\n") for line in lines]
-            if not self.mute:
-                os.write(self._far, b"".join(answers))
+                answers = self.robot.receive(os.read(self._far, 4096))
+                if not self.mute:
+                    os.write(self._far, answers)
 
 
 async def connected(endpoint: str, stack: contextlib.AsyncExitStack) -> zbridge.Fleet:

@@ -8,47 +8,21 @@ import pytest
 from khepera import PROTOCOL
 from khepera.messages import LINES, Positions, Proximity, SetLed, SetSpeeds, Speeds, Version
 from khepera.session import KheperaSession
-from khepera.simulator import STEP_S, Khepera
+from khepera.simulator import Khepera
 from khepera.translate import KheperaRobot, Options
 
 from zbridge.errors import EncodeError, ProtocolError, Refused
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Drive, FleetMessage, Mode, Switch
-from zbridge.protocol.session import State
-
-
-class Scene:
-    """A gateway's robot and the simulated one, connected without a link; ``run`` advances time."""
-
-    def __init__(self) -> None:
-        self.robot = KheperaRobot(Options())
-        self.simulated = Khepera()
-        self.session = self.robot.session("robot", "tcp://robot.test:1")
-        self.shown: dict[str, FleetMessage] = {}
-        self.lines: list[bytes] = []
-        self.answers = True
-        self.now = 0.0
-        self.session.open(0.0)
-
-    def run(self, seconds: float) -> None:
-        for _ in range(round(seconds / STEP_S)):
-            self.now += STEP_S
-            self.simulated.step(STEP_S)
-            self.session.expire(self.now)
-            while (line := self.session.outgoing(self.now)) is not None:
-                self.lines.append(line)
-                answer = self.simulated.answer(line) if self.answers else b""
-                for message in self.session.receive(answer, self.now):
-                    self.shown |= {topic.path: shown for topic, shown in self.robot.telemetry(message, 1)}
-
-    def drive(self, forward: float, turn: float = 0.0) -> None:
-        self.robot.command(topics.CMD_DRIVE, Drive(forward=forward, turn=turn), self.now)
+from zbridge.fleet.messages import Drive, Mode, Switch
+from zbridge.protocol import State
+from zbridge.simulation import STEP_S, Scene
 
 
 @pytest.fixture
 def scene() -> Scene:
-    scene = Scene()
-    scene.run(0.2)
+    """A gateway's robot and the simulated one, established."""
+    scene = Scene(PROTOCOL, Khepera())
+    scene.run(1.2)  # the stop that greets the robot is over
     assert scene.session.state is State.ESTABLISHED
     return scene
 
@@ -73,15 +47,15 @@ def test_a_speed_out_of_range_is_not_encoded() -> None:
 
 
 def test_the_version_is_the_handshake_and_polls_follow_at_20_hz(scene: Scene) -> None:
-    assert (scene.lines[0], scene.session.version) == (b"B\n", "5.1")
-    scene.lines.clear()
+    assert (scene.written[0], scene.session.version) == (b"B\n", "5.1")
+    scene.written.clear()
     scene.run(1.0)
     for poll in (b"H\n", b"E\n", b"N\n"):
-        assert 15 <= scene.lines.count(poll) <= 20
+        assert 15 <= scene.written.count(poll) <= 20
 
 
 def test_a_robot_that_does_not_answer_is_lost() -> None:
-    scene = Scene()
+    scene = Scene(PROTOCOL, Khepera())
     scene.answers = False
     scene.run(6.0)
     assert (scene.session.state, scene.session.version) == (State.CLOSED, None)
@@ -94,7 +68,7 @@ def test_forward_is_along_x_and_a_left_turn_counter_clockwise(scene: Scene) -> N
     assert pose.x == pytest.approx(0.2, abs=0.02)
     assert (pose.y, pose.heading) == (0.0, 0.0)
     assert scene.shown["motion"].speed == pytest.approx(0.4, abs=0.02)
-    scene.drive(0.0, 1.0)
+    scene.drive(turn=1.0)
     scene.run(1.0)
     assert scene.shown["pose"].heading == pytest.approx(1.0, abs=0.2)
     assert scene.simulated.body.heading == pytest.approx(scene.shown["pose"].heading, abs=0.1)
@@ -103,13 +77,13 @@ def test_forward_is_along_x_and_a_left_turn_counter_clockwise(scene: Scene) -> N
 def test_a_stop_precedes_queued_requests_and_the_robot_stops(scene: Scene) -> None:
     scene.drive(1.0)
     scene.run(0.5)
-    scene.robot.command(topics.CMD_LIGHT, Switch(on=True), scene.now)
+    scene.command(topics.CMD_LIGHT, Switch(on=True))
     scene.drive(0.5)
-    scene.lines.clear()
-    scene.robot.stop(scene.now, scene.now + 1.0)
+    scene.written.clear()
+    scene.stop()
     scene.run(1.5)
-    assert scene.lines[0] == b"D,0,0\n"
-    assert {line for line in scene.lines if line.startswith(b"D")} == {b"D,0,0\n"}
+    assert scene.written[0] == b"D,0,0\n"
+    assert {line for line in scene.written if line.startswith(b"D")} == {b"D,0,0\n"}
     assert scene.simulated.speeds == SetSpeeds(0, 0)
     assert scene.simulated.leds == {0: True}
 
@@ -125,8 +99,8 @@ def test_a_robot_that_falls_silent_gets_no_commands_and_is_finally_lost(scene: S
 
 def test_the_simulated_robot_stops_during_a_silence() -> None:
     robot = Khepera()
-    assert robot.answer(b"D,100,100\n") == b"d\n"
-    assert robot.answer(b"nonsense\n") == b""
+    assert robot.receive(b"D,100,100\n") == b"d\n"
+    assert robot.receive(b"nonsense\n") == b""
     for _ in range(101):
         robot.step(STEP_S)
     assert robot.speeds == SetSpeeds(0, 0)
@@ -143,8 +117,8 @@ def test_a_near_obstacle_is_a_short_range_at_its_bearing() -> None:
 def test_an_unsupported_command_is_refused_with_a_reason(scene: Scene) -> None:
     for topic, command in ((topics.CMD_DRIVE, Drive(left=1.0)), (topics.CMD_MODE, Mode(mode="manual"))):
         with pytest.raises(Refused):
-            scene.robot.command(topic, command, scene.now)
-    outcome = scene.robot.command(topics.CMD_DRIVE, Drive(forward=0.1, left=0.1), scene.now)
+            scene.command(topic, command)
+    outcome = scene.drive(0.1, left=0.1)
     assert outcome.left_out == "left: it does not move sideways"
     with pytest.raises(Refused):
         scene.robot.ask(topics.POSE)

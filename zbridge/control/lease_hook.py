@@ -1,0 +1,36 @@
+"""Tells a robot's protocol when a lease begins and ends, so that motors can be on while somebody drives."""
+
+from __future__ import annotations
+
+from zbridge.control.authority import Authority
+from zbridge.control.context import RobotContext
+from zbridge.errors import Refused
+from zbridge.protocol.session import State
+
+
+class LeaseHook:
+    """Calls :meth:`RobotSide.leased` of one robot."""
+
+    def __init__(self, context: RobotContext, authority: Authority) -> None:
+        self._context = context
+        self._authority = authority
+        self._told = False
+        """What the protocol knows."""
+
+    def __repr__(self) -> str:
+        return f"<LeaseHook {self._context.keys.robot} {'leased' if self._told else 'free'}>"
+
+    def tell(self, *, anew: bool = False) -> None:
+        """Tell whether somebody has the lease, if that has changed, or ``anew``; not before the session is there."""
+        leased = self._authority.holders.current is not None
+        session = self._context.robot.driving
+        if (leased is self._told and not anew) or session is None or session.state is not State.ESTABLISHED:
+            return
+        self._told = leased
+        try:
+            self._context.robot.leased(leased, self._context.clock())
+        except Refused as refusal:
+            self._authority.refuse("leased", refusal)
+        except Exception as error:  # of a protocol's own code: it must not affect who may drive
+            self._context.faults.note("leased", error)
+        self._context.pump()

@@ -1,0 +1,91 @@
+"""A scene for the tests of a protocol: its robot side and a simulated robot, without a link, in virtual time."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import Any
+
+import msgspec
+
+from zbridge.errors import ProtocolError, Refused
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Drive, FleetMessage
+from zbridge.fleet.topics import Topic
+from zbridge.metrics import Metrics
+from zbridge.protocol.plugin import Outcome, Protocol, RobotSide
+from zbridge.protocol.session import Session, State
+from zbridge.simulation.simulated import STEP_S, SimulatedRobot
+
+_NS_PER_S = 1_000_000_000
+
+
+class Scene:
+    """A protocol's robot side, as a gateway has it, connected to a simulated robot. Time passes in :meth:`run` only.
+
+    options: ``[device.options]``; None: those that fit the simulated robot.
+    """
+
+    def __init__(self, protocol: Protocol, simulated: SimulatedRobot, options: dict[str, Any] | None = None) -> None:
+        chosen = msgspec.convert(protocol.simulated if options is None else options, protocol.options)
+        self.robot: RobotSide = protocol.robot(chosen, 1, Metrics())
+        self.simulated = simulated
+        self.session: Session[Any]
+        """The conversation; :meth:`connect` makes a new one."""
+        self.now = 0.0
+        """Seconds since the scene began; also the time that the stamps show, in ns."""
+        self.shown: dict[str, FleetMessage] = {}
+        """The newest telemetry, by the paths of its topics: ``pose``, ``sensor/front``."""
+        self.written: list[bytes] = []
+        """What the gateway's side wrote, frame by frame."""
+        self.answers = True
+        """False: what the robot sends is lost, as by a cable that is cut in one direction."""
+        self.connect()
+
+    def __repr__(self) -> str:
+        return f"<Scene at {self.now:g} s, {self.session!r}>"
+
+    def connect(self) -> None:
+        """Connect, for the first time or anew; the connection before is lost."""
+        if self.robot.driving is not None:
+            self.robot.driving.fail("closed by peer")
+        self.session = self.robot.session(self.robot.link_names[0], "tcp://robot.test:1")
+        self._greeted = False
+        self.session.open(self.now)
+        self._hear(self.simulated.connected())
+
+    def run(self, seconds: float) -> None:
+        """Let time pass."""
+        for _ in range(round(seconds / STEP_S)):
+            self.now += STEP_S
+            self._hear(self.simulated.step(STEP_S))
+            self.session.expire(self.now)
+            while (frame := self.session.outgoing(self.now)) is not None:
+                self.session.outbox.written(self.now)
+                self.written.append(frame)
+                self._hear(self.simulated.receive(frame))
+
+    def drive(self, forward: float = 0.0, left: float = 0.0, turn: float = 0.0) -> Outcome:
+        """Command a drive, fractions of full scale; raise Refused."""
+        return self.command(topics.CMD_DRIVE, Drive(forward=forward, left=left, turn=turn))
+
+    def command(self, topic: Topic, command: FleetMessage) -> Outcome:
+        """Command the robot as the gateway does; raise Refused where the robot is not ready, or refuses."""
+        return self.robot.command(topic, command, self.now)
+
+    def stop(self, repeated_s: float = 1.0) -> None:
+        """Stop the robot, as the gateway does."""
+        self.robot.stop(self.now, self.now + repeated_s)
+
+    def _hear(self, data: bytes) -> None:
+        if not self.answers or not data:
+            return
+        for message in self.session.receive(data, self.now):
+            with contextlib.suppress(ProtocolError):
+                stamp_ns = round(self.now * _NS_PER_S)
+                self.shown |= {topic.path: shown for topic, shown in self.robot.telemetry(message, stamp_ns)}
+        if self.session.state is State.ESTABLISHED and not self._greeted:
+            self._greeted = True
+            with contextlib.suppress(Refused):
+                self.stop()
+            self.robot.leased(False, self.now)
+            self.shown |= {topic.path: shown for topic, shown in self.robot.begun(round(self.now * _NS_PER_S))}

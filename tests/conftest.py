@@ -12,6 +12,7 @@ from hypothesis import HealthCheck, settings
 from tests import STATE
 from tests.clock import JumpingLoop
 
+collect_ignore = ["vectors"]  # among them packages with tests of their own
 _numbers = itertools.count()
 REAL = ("tests/e2e/*", "tests/gateways/*/conformance/*")
 """Where tests take real sockets and real time: scenes on Zenoh, and the judges against plain sockets."""

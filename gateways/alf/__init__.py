@@ -92,4 +92,5 @@ PROTOCOL = Protocol(
     template=TEMPLATE,
     codecs=codecs(),
     hq_template=HQ_TEMPLATE,
+    plausible={"motion.temperature": (-40.0, 125.0)},
 )

@@ -6,6 +6,7 @@ handshake: a session is established at once.
 
 from __future__ import annotations
 
+import math
 from typing import Any, ClassVar
 
 import msgspec
@@ -95,6 +96,7 @@ class AlfHqRole(AlfSession):
     """We play HQ towards a vehicle. ``at_first``: the command that a link that drives repeats from the start."""
 
     role = Role.HQ
+    silent_s = math.inf  # a vehicle without a scanner says nothing for seconds
     at_first: messages.DriveCommand | None = None
 
     def opened(self, now: float) -> None:

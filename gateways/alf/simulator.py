@@ -15,6 +15,7 @@ import numpy as np
 from gateways.alf.messages import AlfDialect, AlfMessage, DriveCommand, DriveInfo, Measurement, ScannerInit
 from gateways.alf.session import VehicleRole
 from gateways.alf.translate import DRIVE, LASER, VEHICLE
+from zbridge.protocol import Truth
 from zbridge.simulation.simulator import STEP_S, Simulator
 from zbridge.simulation.world import Body, cast
 from zbridge.transport import Conversation
@@ -60,6 +61,10 @@ class Car:
 
     def __repr__(self) -> str:
         return f"<Car {self.body} at {self.speed_m_s:.2f} m/s>"
+
+    @property
+    def neutral(self) -> bool:
+        return not self._wanted_m_s
 
     def take(self, command: DriveCommand) -> None:
         straight = _FULL_LOCK_DEG if self._dialect is AlfDialect.BINARY else 0
@@ -110,6 +115,7 @@ class VehicleSimulator(Simulator[AlfMessage]):
     def __init__(self, seed: int, dialect: AlfDialect, links: int) -> None:
         super().__init__(log, links=(DRIVE, LASER) if links > 1 else (VEHICLE,))
         self.car = Car(seed, dialect)
+        self.body = self.car.body
         self._dialect = dialect
         self._drive, self._laser = (DRIVE, LASER) if links > 1 else (VEHICLE, VEHICLE)
 
@@ -117,6 +123,10 @@ class VehicleSimulator(Simulator[AlfMessage]):
         session = VehicleRole(self._dialect)
         session.name = f"hq {peer}"
         return session
+
+    def truth(self) -> Truth:
+        body = self.car.body
+        return Truth(body.x, body.y, body.heading, neutral=self.car.neutral)
 
     def greet(self, client: Conversation, link: str) -> None:
         """Describe the scanner, before anything is measured."""

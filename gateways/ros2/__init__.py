@@ -75,4 +75,5 @@ PROTOCOL = Protocol(
     codecs=(Codec("samples", write_sample, read_sample, sample_end, tuple(map(KeyedSample, SampleKind))),),
     keyed=True,
     requires=("rosbags", "xxhash"),
+    plausible={"battery.voltage": (1.0, 100.0), "battery.current": (-1000.0, 1000.0)},
 )

@@ -11,6 +11,7 @@ import math
 import random
 import socket
 import time
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -29,6 +30,7 @@ from zbridge.protocol import (
     Session,
     Simulation,
     State,
+    Truth,
     read_sample,
     sample_end,
     subscription,
@@ -129,6 +131,10 @@ class RosMachine:
     def __repr__(self) -> str:
         return f"<RosMachine {self.body} {self.forward:+.2f} m/s {self.turn:+.2f} rad/s>"
 
+    def truth(self) -> Truth:
+        body = self.body
+        return Truth(body.x, body.y, body.heading, neutral=not (self.forward or self.turn))
+
     def take(self, twist: Any) -> None:
         forward, turn = float(twist.linear.x), float(twist.angular.z)
         if math.isfinite(forward) and math.isfinite(turn):
@@ -227,10 +233,11 @@ async def simulate(simulation: Simulation) -> None:
             machine.take(twist)
 
     conversation = Conversation(session, asyncio.get_running_loop(), ConversationHooks(deliver=deliver))
+    machine.body.place(simulation.place)
     async with serve(address, conversation):
         simulation.ready((address,))
         try:
-            await live(partial(_step, machine, session, conversation))
+            await live(partial(_step, machine, session, conversation, simulation.report))
         finally:
             conversation.close("simulator ended")
 
@@ -243,8 +250,11 @@ def _with_port(address: Address) -> Address:
         return Address(address.host, int(free.getsockname()[1]))
 
 
-def _step(machine: RosMachine, session: NodeRole, conversation: Conversation, steps: int) -> None:
+def _step(
+    machine: RosMachine, session: NodeRole, conversation: Conversation, report: Callable[[Truth], None], steps: int
+) -> None:
     machine.step(STEP_S)
+    report(machine.truth())
     if session.state is not State.ESTABLISHED:
         return
     seconds, nanoseconds = divmod(time.time_ns(), _NS_PER_S)

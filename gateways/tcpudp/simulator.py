@@ -17,7 +17,7 @@ from gateways.tcpudp import messages as packets
 from gateways.tcpudp.session import limits
 from gateways.tcpudp.session.robot_role import RobotRole
 from gateways.tcpudp.settings import ROBOT_BLOCKS, VERSIONS, Feature, RobotSettings13, Settings
-from zbridge.protocol import ClientIds, Session
+from zbridge.protocol import ClientIds, Session, Truth
 from zbridge.simulation.simulator import STEP_S, Simulator
 from zbridge.simulation.world import Body, Grid, cast
 from zbridge.transport import Conversation
@@ -145,6 +145,7 @@ class RobotSimulator(Simulator[packets.Packet]):
     def __init__(self, seed: int, version: str = "1.3", *, udp: bool = False) -> None:
         super().__init__(log, datagrams=udp)
         self.vehicle = Vehicle(seed)
+        self.body = self.vehicle.body
         self.vehicle.sweep_lidar()
         self._versions = VERSIONS[version].listed.split(",")
         self._settings = settings_of(version, udp=udp)
@@ -158,6 +159,10 @@ class RobotSimulator(Simulator[packets.Packet]):
         session = RobotRole(limits(0.0), self._settings, client_id, self._versions)
         session.name = f"hq {client_id}"
         return session
+
+    def truth(self) -> Truth:
+        body = self.vehicle.body
+        return Truth(body.x, body.y, body.heading, neutral=not self.vehicle.moving)
 
     def dismiss(self, client: Conversation) -> None:
         assert isinstance(client.session, RobotRole)

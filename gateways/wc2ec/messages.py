@@ -154,8 +154,11 @@ def frame_end(dialect: Wc2EcDialect, sender: Role, *, values: int = 0) -> FrameE
 
 
 def read(frame: bytes, dialect: Wc2EcDialect) -> Wc2EcMessage:
-    """Read one message; the framing has checked the command."""
-    return MESSAGES[dialect][frame[0]].codec.decode(frame, 1)
+    """Read one message; raise ProtocolError if it is none of the dialect's."""
+    spec = MESSAGES[dialect].get(frame[0])
+    if spec is None:
+        raise ProtocolError(f"command {frame[0]}, expected one of {sorted(MESSAGES[dialect])}")
+    return spec.codec.decode(frame, 1)
 
 
 def write(message: Wc2EcMessage, dialect: Wc2EcDialect) -> bytes:

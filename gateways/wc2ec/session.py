@@ -58,6 +58,7 @@ class ExternalRole(Wc2EcSession):
 
     kept: ClassVar[dict[str, Any]] = {"_settled_at": float}
     role = Role.HQ
+    silent_s = math.inf  # a simulation that is paused says nothing
 
     def __init__(self, dialect: Wc2EcDialect) -> None:
         super().__init__(dialect)

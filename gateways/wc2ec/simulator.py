@@ -24,6 +24,7 @@ from gateways.wc2ec.messages import (
     Wc2EcMessage,
 )
 from gateways.wc2ec.session import ControllerRole
+from zbridge.protocol import Truth
 from zbridge.simulation.simulator import STEP_S, Simulator
 from zbridge.simulation.world import Body, cast
 from zbridge.transport import Conversation
@@ -83,8 +84,13 @@ class WebotsMachine:
             case SetSensor(number=number, values=values) if number in self.settings:
                 self.settings[number] = values.tolist()
 
+    @property
+    def wheels_m_s(self) -> tuple[float, float]:
+        """The speeds of the left and the right wheel over ground."""
+        return self.velocities[_LEFT] * WHEEL_RADIUS_M, self.velocities[_RIGHT] * WHEEL_RADIUS_M
+
     def step(self, dt: float) -> None:
-        left, right = self.velocities[_LEFT] * WHEEL_RADIUS_M, self.velocities[_RIGHT] * WHEEL_RADIUS_M
+        left, right = self.wheels_m_s
         self.body.step((left + right) / 2, 0.0, (right - left) / TRACK_M, dt)
         way = self._lift_to_m - self.lift_m
         self.lift_m += max(-LIFT_M_S * dt, min(LIFT_M_S * dt, way))
@@ -112,12 +118,17 @@ class ControllerSimulator(Simulator[Wc2EcMessage]):
     def __init__(self, seed: int, dialect: Wc2EcDialect) -> None:
         super().__init__(log)
         self.machine = WebotsMachine(seed)
+        self.body = self.machine.body
         self._dialect = dialect
 
     def session(self, peer: str, link: str) -> ControllerRole:
         session = ControllerRole(self._dialect, values=VALUES)
         session.name = f"controller {peer}"
         return session
+
+    def truth(self) -> Truth:
+        body, wheels = self.machine.body, self.machine.wheels_m_s
+        return Truth(body.x, body.y, body.heading, wheels, neutral=not any(wheels))
 
     def greet(self, client: Conversation, link: str) -> None:
         """Register the devices, before any data."""

@@ -18,12 +18,15 @@ from zbridge.fleet.messages import Drive, Switch
 from zbridge.protocol.plugin import Outcome, Protocol, Simulation
 from zbridge.protocol.session import Session
 from zbridge.simulation import check as kit
-from zbridge.simulation.check import check_plugin
-from zbridge.simulation.check_commands import check_commands, check_stop
-from zbridge.simulation.check_messages import check_messages
-from zbridge.simulation.check_motion import check_motion
-from zbridge.simulation.check_sessions import check_sessions
-from zbridge.simulation.check_stage import CheckFinding, Transcript, record
+from zbridge.simulation.checks.commands import check_commands
+from zbridge.simulation.checks.finding import CheckFinding
+from zbridge.simulation.checks.messages import check_messages
+from zbridge.simulation.checks.motion import check_motion
+from zbridge.simulation.checks.package import check_package
+from zbridge.simulation.checks.rehearsal import Transcript
+from zbridge.simulation.checks.sessions import check_sessions
+from zbridge.simulation.checks.stage import live, record
+from zbridge.simulation.checks.stops import check_stops
 
 TOY: Protocol = toy.PROTOCOL
 
@@ -33,7 +36,7 @@ def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
     """Watch the toy for a shorter time: it shows its pose ten times a second."""
     times = {"DRIVE_S": 0.5, "IDLE_S": 0.1, "STAND_S": 0.4, "TURN_S": 0.3, "WATCHED_S": 0.5}
     for name, seconds in times.items():
-        monkeypatch.setattr(f"zbridge.simulation.check_motion.{name}", seconds)
+        monkeypatch.setattr(f"zbridge.simulation.checks.motion.{name}", seconds)
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +55,15 @@ def assert_found(findings: Iterable[CheckFinding], expected: dict[str, str]) -> 
     for claim, problem in expected.items():
         assert any(claim in one and problem in found[one] for one in found), found
     assert [one for one in found if not any(claim in one for claim in expected)] == []
+
+
+def motion(protocol: Protocol) -> list[CheckFinding]:
+    async def drive() -> list[CheckFinding]:
+        async with live(protocol) as stage:
+            assert await stage.established(5.0)
+            return await check_motion(protocol, stage)
+
+    return asyncio.run(drive())
 
 
 def claims(value: object) -> str:
@@ -97,6 +109,7 @@ def breaks_on_noise(frame: bytes) -> Any:
 
 ROUND_TRIP, CUTS, NOISE = "lines: 1 messages round-trip", "lines: whole, byte by byte", "lines: random bytes"
 TRUNCATED, NAME = "lines: what is cut off", "the protocol has the name of its entry point"
+DAMAGED = "lines: any fields behind a right checksum"
 TEMPLATE, SHOWN = "the template is a configuration of this protocol", "a session can be shown"
 
 
@@ -111,7 +124,7 @@ TEMPLATE, SHOWN = "the template is a configuration of this protocol", "a session
         (with_session(role=None), {SHOWN: "role is None, not Role.HQ"}),
         (with_session(version=property(lambda self: 1 / 0)), {SHOWN: "Error"}),
         (broken(codecs=()), {"messages are declared": "codecs is empty"}),
-        (with_codec(read=lambda frame: toy.At(toy.read(frame).x, 0.0, 0.0)), {ROUND_TRIP: "was read as"}),
+        (with_codec(read=lambda frame: toy.At(toy.read(frame).x, 0.0, 0.0)), {ROUND_TRIP: "which is read as"}),
         (with_codec(write=lambda message: 1 / 0), {ROUND_TRIP: "ZeroDivisionError"}),
         (with_codec(messages=(object,)), {ROUND_TRIP: "object: the kit can make no example"}),
         (
@@ -122,7 +135,7 @@ TEMPLATE, SHOWN = "the template is a configuration of this protocol", "a session
             },
         ),
         (with_codec(frame_end=lambda data, start: start + 1000), {CUTS: "is cut to []"}),
-        (with_codec(read=breaks_on_noise), {NOISE: "test_check.py:"}),
+        (with_codec(read=breaks_on_noise), {NOISE: "test_check.py:", DAMAGED: "KeyError"}),
         (
             with_codec(frame_end=lambda data, start: start if data[start] == 0 else toy_end(data, start)),
             {NOISE: "tests.simulation.test_check.<lambda> returned a frame of 0 bytes, expected 1 or more"},
@@ -132,7 +145,12 @@ TEMPLATE, SHOWN = "the template is a configuration of this protocol", "a session
                 frame_end=lambda data, start: len(data),
                 read=lambda frame: toy.read(frame) if frame.endswith(b"\n") else 1 / 0,
             ),
-            {CUTS: "byte by byte is cut to", TRUNCATED: "ZeroDivisionError", NOISE: "ZeroDivisionError"},
+            {
+                CUTS: "byte by byte is cut to",
+                TRUNCATED: "ZeroDivisionError",
+                NOISE: "ZeroDivisionError",
+                DAMAGED: "ZeroDi",
+            },
         ),
         (
             with_codec(
@@ -145,7 +163,7 @@ TEMPLATE, SHOWN = "the template is a configuration of this protocol", "a session
     ids=claims,
 )
 def test_a_broken_protocol_object_and_broken_messages_are_found(protocol: Protocol, expected: dict[str, str]) -> None:
-    assert_found([*check_plugin(protocol, "toy"), *check_messages(protocol)], expected)
+    assert_found([*check_package(protocol, "toy"), *check_messages(protocol)], expected)
 
 
 # Sessions
@@ -192,6 +210,7 @@ def test_a_robot_with_other_links_than_its_protocol_is_found() -> None:
 
 
 GARBAGE, SILENCE, END = "garbage at", "silence at", "the end of the connection at"
+SILENT, ALIVE = "a robot that falls silent is not driven", "the keep-alive is written in time"
 TRANSLATED = "messages of the robot are translated"
 
 
@@ -207,9 +226,18 @@ TRANSLATED = "messages of the robot are translated"
             ),
             {SILENCE: "still handshaking after 6 s"},
         ),
-        (with_session(fail=lambda self, reason: None), {END: "still does something"}),
-        (with_session(timers=lambda self: 0.0), {"what the robot said establishes a session": "writes and timers"}),
-        (with_robot(pose=lambda self, message, stamp_ns: {}[message.x]), {TRANSLATED: "KeyError", GARBAGE: "KeyError"}),
+        (
+            with_session(fail=lambda self, reason: None),
+            {END: "still does something", SILENCE: "deadline() is always due"},
+        ),
+        (
+            with_session(timers=lambda self: 0.0),
+            {"what the robot said establishes a session": "BrokenSession.timers() is always due: 0"},
+        ),
+        (
+            with_robot(pose=lambda self, message, stamp_ns: {}[message.x]),
+            {TRANSLATED: "KeyError", GARBAGE: "KeyError", SILENT: "KeyError", ALIVE: "KeyError"},
+        ),
         (with_robot(pose=lambda *_: ((topics.POSE, Switch(on=True)),)), {TRANSLATED: "PayloadError"}),
         (
             with_robot(pose=lambda self, message, stamp_ns: toy.ToyRobot.pose(self, message, 0)),
@@ -240,7 +268,7 @@ STILL = b"go 0.000000 0.000000\n"
     ("stop", "expected"),
     [
         (toy.ToyRobot.stop, {}),
-        (lambda self, now, until: None, {STOP_FIRST: "a stop writes nothing"}),
+        (lambda self, now, until: None, {STOP_FIRST: "BrokenRobot.stop writes nothing"}),
         (
             lambda self, now, until: self._session.outbox.put(STILL),
             {STOP_FIRST: "is written before the stop", REPEATED: "", STOP_EARLY: "AttributeError"},
@@ -251,7 +279,7 @@ STILL = b"go 0.000000 0.000000\n"
         ),
         (
             lambda self, now, until: toy.ToyRobot._go(self, 0.0, 0.0, now, until=now, urgent=True),
-            {REPEATED: "it is not written again"},
+            {REPEATED: "is not written again"},
         ),
         (
             lambda self, now, until: self._session.outbox.set(
@@ -263,9 +291,10 @@ STILL = b"go 0.000000 0.000000\n"
     ids=["sound", "nothing", "last", "after what waits", "once", "beside the motion"],
 )
 def test_a_stop_that_is_not_first_or_does_not_last_is_found(heard: Transcript, stop, expected: dict[str, str]) -> None:
-    assert_found(check_stop(with_robot(stop=stop), heard), expected)
+    assert_found(check_stops(with_robot(stop=stop), heard), expected)
 
 
+DROPPED = "no part of a drive is dropped"
 OTHERS = [f"@cmd/{name}" for name in ("mode", "light", "lidar", "camera", "text", "scan", "motor", "sensor", "raw")]
 QUESTIONS = ("a question for map is answered", "a question for pose is answered")
 
@@ -279,11 +308,20 @@ def only_drives(self: Any, topic: Any, command: Any, now: float) -> Outcome:
     [
         ({}, {}),
         ({"command": only_drives}, dict.fromkeys(OTHERS, "accepted, but nothing is")),
-        ({"command": lambda self, topic, command, now: {Drive: Outcome()}[type(command)]}, {"@cmd/": "KeyError"}),
+        (
+            {"command": lambda self, topic, command, now: {Drive: Outcome()}[type(command)]},
+            {
+                "@cmd/": "KeyError",
+                DROPPED: "writes what Drive(forward=0.5",
+            },
+        ),
         ({"ask": lambda self, topic: None}, dict.fromkeys(QUESTIONS, "nothing is written for it")),
         (
             {"_go": lambda self, forward, turn, now: self._session.outbox.put({False: b"go"}[forward + turn == 2])},
-            {"drives at full scale": "KeyError: True in <lambda> (test_check.py:"},
+            {
+                "drives at full scale": "KeyError: True in <lambda> (test_check.py:",
+                DROPPED: "expected one that names turn",
+            },
         ),
     ],
     ids=claims,
@@ -312,25 +350,26 @@ class Sized(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 DRIVES, TURNS = "the simulated robot drives", "a turn of the simulated robot is counter-clockwise"
-STANDS = "the simulated robot stands after its stop"
+STANDS, WHOLE = "the simulated robot stands after its stop", "a stop ends a drive and a turn alike"
+AHEAD, SPEED, RATE = "it drives ahead after a turn", "it drives as fast as", "it turns as fast as"
 
 
 @pytest.mark.parametrize(
     ("protocol", "expected"),
     [
-        (with_wheels(0, 0), {DRIVES: "it moved 0.000 m", TURNS: "its heading changed by 0."}),
-        (with_robot(stop=lambda self, now, until: None), {STANDS: "it moves on"}),
-        (with_wheels(-1, -1), {DRIVES: "it moved -0.", TURNS: "its heading changed by -0."}),
+        (with_wheels(0, 0), {DRIVES: "it moved 0.000 m", TURNS: "its heading changed by 0.", AHEAD: "0.000 m"}),
+        (with_robot(stop=lambda self, now, until: None), {STANDS: "it moves on", WHOLE: "it moves on"}),
+        (with_wheels(-1, -1), {DRIVES: "it moved -0.", TURNS: "its heading changed by -0.", AHEAD: "it moved -0."}),
         (broken(options=Sized), {}),
         (
             broken(options=Sized, simulated={"speed_full_m_s": 10.0, "turn_full_rad_s": 10.0}),
-            {DRIVES: "m, but the options say", TURNS: "rad, but the options say"},
+            {SPEED: "m/s, the options say 4.000 m/s", RATE: "rad/s, the options say 10.000 rad/s"},
         ),
     ],
     ids=["does not move", "does not stand", "goes the other way", "as the options say", "not as the options say"],
 )
 def test_a_simulated_robot_that_does_not_move_as_it_should_is_found(protocol: Protocol, expected) -> None:
-    assert_found(check_motion(protocol, 5.0), expected)
+    assert_found(motion(protocol), expected)
 
 
 def test_a_simulation_that_cannot_start_is_found() -> None:
@@ -347,7 +386,7 @@ def test_the_whole_check_passes_for_a_sound_protocol(monkeypatch, capsys) -> Non
     monkeypatch.setattr(kit, "find_protocol", lambda name: TOY)
     assert kit.main(["toy"]) == 0
     out = capsys.readouterr().out
-    assert out.endswith("hold, 0 do not\n")
+    assert out.endswith("hold, 0 do not, 8 not checked\n")
     assert "ok    the simulated robot drives" in out
 
 
@@ -362,7 +401,7 @@ def test_what_does_not_hold_is_printed_and_is_the_exit_status(monkeypatch, capsy
     assert kit.main(["toy"]) == 1
     assert capsys.readouterr().out.splitlines() == [
         *("ok    one", "FAIL  two", "      it does not"),
-        *("FAIL  three (tried)", "      a; b; c (and 1 more)", "toy: 1 hold, 2 do not"),
+        *("FAIL  three (tried)", "      a; b; c (and 1 more)", "toy: 1 hold, 2 do not, 0 not checked"),
     ]
 
 

@@ -33,7 +33,8 @@ class Truth(msgspec.Struct, frozen=True):
 
     x, y, heading: metres and radians in the room, counter-clockwise (REP 103). wheels_m_s: the speed of each side over
     ground, left first; empty: it has no such sides. neutral: whether its motors are told to stand still.
-    wraps: how often one of its counters has begun anew.
+    wraps: how often one of its counters has begun anew. watchdog: whether its watchdog has stopped it, because a
+    keep-alive or a request was missing.
     """
 
     x: float
@@ -42,6 +43,7 @@ class Truth(msgspec.Struct, frozen=True):
     wheels_m_s: tuple[float, ...] = ()
     neutral: bool = False
     wraps: int = 0
+    watchdog: bool = False
 
 
 class Simulation(msgspec.Struct, frozen=True):

@@ -1,9 +1,8 @@
 """The conformance kit: ``python -m zbridge.simulation.check NAME`` checks an installed protocol.
 
-It prints one line per requirement, and exits with 0 if all hold, else with 1. The
-checks are in ``check_plugin`` (name, template), ``check_messages`` (what is read and written), ``check_sessions``
-(handshake, garbage, silence, end), ``check_commands`` (stop, commands) and ``check_motion`` (the simulated robot drives
-and stops). Knows no protocol.
+It prints one line for each claim: ``ok``, ``FAIL`` with what is wrong, or ``?`` with the reason why the claim could not
+be checked. Its exit status is 0 if no claim fails, else 1. The checks are in :mod:`zbridge.simulation.checks`. Knows no
+protocol.
 """
 
 from __future__ import annotations
@@ -11,20 +10,19 @@ from __future__ import annotations
 import asyncio
 import logging
 import sys
-import tomllib
 from collections.abc import Iterator
 
-import msgspec
-
 from zbridge.errors import ConfigError
-from zbridge.fleet.processes import SessionEntry
 from zbridge.protocol.plugin import Protocol, find_protocol
-from zbridge.protocol.session import Role
-from zbridge.simulation.check_commands import check_commands, check_stop
-from zbridge.simulation.check_messages import check_messages
-from zbridge.simulation.check_motion import check_motion
-from zbridge.simulation.check_sessions import check_sessions
-from zbridge.simulation.check_stage import CheckFinding, Transcript, raised, record, robot_of
+from zbridge.simulation.checks.commands import check_commands
+from zbridge.simulation.checks.examples import check_examples
+from zbridge.simulation.checks.finding import CheckFinding, raised
+from zbridge.simulation.checks.live import check_live
+from zbridge.simulation.checks.messages import check_messages
+from zbridge.simulation.checks.package import check_package
+from zbridge.simulation.checks.sessions import ESTABLISHED, check_sessions
+from zbridge.simulation.checks.stage import record
+from zbridge.simulation.checks.stops import check_stops
 
 USAGE = "usage: python -m zbridge.simulation.check NAME\n"
 ESTABLISH_S = 10.0
@@ -33,21 +31,20 @@ ESTABLISH_S = 10.0
 
 def check(protocol: Protocol, name: str, *, establish_s: float = ESTABLISH_S) -> Iterator[CheckFinding]:
     """Check a protocol, installed as ``name``; yield the findings in the order of the checks."""
-    yield from check_plugin(protocol, name)
+    yield from check_package(protocol, name)
     yield from check_messages(protocol)
-    recording = Transcript()
+    yield from check_examples(protocol)
     try:
         recording = asyncio.run(record(protocol, establish_s))
     except Exception as error:  # whatever the protocol's own code raises is a finding
-        problem = raised(error, "a simulated robot that listens")
-        yield CheckFinding("the session with the simulated robot is established", problem)
+        yield CheckFinding(ESTABLISHED, raised(error, "a simulated robot that listens"), guide="7. A simulated robot")
         return
     yield from check_sessions(protocol, recording)
     if not recording.established:
         return
-    yield from check_stop(protocol, recording)
+    yield from check_stops(protocol, recording)
     yield from check_commands(protocol, recording)
-    yield from check_motion(protocol, establish_s)
+    yield from check_live(protocol, establish_s)
 
 
 def main(arguments: list[str]) -> int:
@@ -63,43 +60,15 @@ def main(arguments: list[str]) -> int:
     except ConfigError as error:
         sys.stderr.write(f"{error}\n")
         return 2
-    failed = held = 0
+    failed = held = unchecked = 0
     for finding in check(protocol, arguments[0]):
-        failed, held = failed + (finding.problem is not None), held + (finding.problem is None)
+        failed += finding.problem is not None
+        unchecked += finding.unchecked is not None
+        held += finding.problem is None and finding.unchecked is None
         sys.stdout.write(f"{finding}\n")
         sys.stdout.flush()
-    sys.stdout.write(f"{protocol.name}: {held} hold, {failed} do not\n")
+    sys.stdout.write(f"{protocol.name}: {held} hold, {failed} do not, {unchecked} not checked\n")
     return 1 if failed else 0
-
-
-def check_plugin(protocol: Protocol, name: str) -> Iterator[CheckFinding]:
-    """Check what the gateway needs before the first connection. name: of the entry point."""
-    other = f"the entry point is {name!r}, Protocol.name is {protocol.name!r}" if protocol.name != name else None
-    yield CheckFinding("the protocol has the name of its entry point", other)
-    yield CheckFinding.tried("the template is a configuration of this protocol", lambda: _template(protocol))
-    yield CheckFinding.tried("a session can be shown", lambda: _shown(protocol))
-
-
-def _template(protocol: Protocol) -> str | None:
-    device = tomllib.loads(protocol.template).get("device")
-    if device is None:
-        return "it has no table [device]"
-    if device.get("protocol") != protocol.name:
-        return f"its protocol is {device.get('protocol')!r}, not {protocol.name!r}"
-    if not device.get("connect"):
-        return "it has no connect"
-    msgspec.convert(device.get("options", {}), protocol.options)
-    return None
-
-
-def _shown(protocol: Protocol) -> str | None:
-    robot = robot_of(protocol)
-    for link in robot.link_names:
-        session = robot.session(link, "tcp://robot.test:1")
-        if not isinstance(session.role, Role):
-            return f"role is {session.role!r}, not Role.HQ"
-        msgspec.convert(msgspec.to_builtins(session.snapshot()), SessionEntry)
-    return None
 
 
 if __name__ == "__main__":

@@ -15,9 +15,10 @@ from functools import partial
 from typing import Any, Generic, TypeVar
 
 from zbridge.errors import EncodeError, Refused
-from zbridge.protocol.plugin import Simulation
+from zbridge.protocol.plugin import Simulation, Truth
 from zbridge.protocol.session import Session, State
 from zbridge.simulation.timing import Ticker
+from zbridge.simulation.world import Body
 from zbridge.transport import Accepted, ClientConversation, Conversation, ConversationHooks, Link, listen
 
 STEP_S = 0.02
@@ -42,6 +43,9 @@ class Simulator(ABC, Generic[M]):
     ``links``: one name for each address of the simulation. ``datagrams``: receive datagrams at the TCP port's number.
     """
 
+    body: Body | None = None
+    """The robot in the room; it begins at ``Simulation.place``."""
+
     def __init__(self, log: logging.Logger, *, links: tuple[str, ...] = ("robot",), datagrams: bool = False) -> None:
         self._log, self._links, self._datagrams = log, links, datagrams
         self._loop = asyncio.get_running_loop()
@@ -60,6 +64,10 @@ class Simulator(ABC, Generic[M]):
     @abstractmethod
     def step(self, steps: int) -> None:
         """Simulate :data:`STEP_S`, and send what is due; ``steps`` counts from 1."""
+
+    def truth(self) -> Truth | None:
+        """Return how the robot really is, for the conformance kit; None: it is not in the room."""
+        return None
 
     def greet(self, client: Conversation, link: str) -> None:
         """Send the first messages of a new client. Nothing that :meth:`tell` sends precedes them."""
@@ -106,12 +114,20 @@ class Simulator(ABC, Generic[M]):
                 )
                 for name, address in zip(self._links, simulation.addresses, strict=True)
             ]
+            if self.body is not None:
+                self.body.place(simulation.place)
             simulation.ready(tuple(addresses))
             try:
-                await live(self.step)
+                await live(partial(self._step, simulation.report))
             finally:
                 for client in tuple(self._clients):
                     client.close("simulator ended")
+
+    def _step(self, report: Callable[[Truth], None], steps: int) -> None:
+        self.step(steps)
+        truth = self.truth()
+        if truth is not None:
+            report(truth)
 
     def _admit(self, link: Link, name: str) -> Conversation | None:
         session = self.session(link.peer, name)

@@ -57,13 +57,18 @@ class Body:
 
     @classmethod
     def placed(cls, place: tuple[float, float, float] | None, *, radius: float = 0.2) -> Body:
-        """Place a robot at (x, y, heading); None: at the origin, heading along x."""
+        """Make a robot at (x, y, heading); None: at the origin, heading along x."""
         return cls(*(place or (0.0, 0.0, 0.0)), radius)
 
     @classmethod
     def somewhere(cls, rng: random.Random, *, heading: float = 0.0, radius: float = 0.2) -> Body:
         """Place a robot near the middle of the room, within 0.3 rad of ``heading``, as the seed says."""
         return cls(rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5), rng.uniform(-0.3, 0.3) + heading, radius)
+
+    def place(self, place: tuple[float, float, float] | None) -> None:
+        """Place the robot at (x, y, heading); None: it stays where it is."""
+        if place is not None:
+            self.x, self.y, self.heading = place
 
     def __repr__(self) -> str:
         return f"<Body x={self.x:.2f} y={self.y:.2f} heading={self.heading:.2f}>"

@@ -113,6 +113,7 @@ class HqHandshake(WatchedSession):
         "_answered": bool | None,
     }
     role = Role.HQ
+    silent_s = math.inf  # a robot need not send anything by itself
     handled = frozenset(
         {packets.ServerSettings, packets.ServerStartUDP, packets.ServerUDPConnection, packets.DebugMessage}
     )

@@ -5,6 +5,7 @@ The robot says ``at X Y HEADING`` ten times a second, and takes ``go FORWARD TUR
 
 import asyncio
 import contextlib
+import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -60,6 +61,7 @@ def read(frame: bytes) -> At:
 class ToySession(Session[At]):
     role = Role.HQ
     frame_end = staticmethod(line_end)
+    silent_s, lost_s = 0.5, 3.0
 
     def encode(self, message: At) -> bytes:
         return write(message)
@@ -98,7 +100,8 @@ class ToyRobot(RobotSide):
         if not isinstance(command, Drive):
             raise Unsupported("it only drives")
         self._go(command.forward, command.turn, now)
-        return Outcome()
+        left_out = [name for name in ("left", "light") if getattr(command, name)]
+        return Outcome(left_out="; ".join(left_out) or None)
 
     def stop(self, now: float, until: float) -> None:
         self._go(0.0, 0.0, now, until=until, urgent=True)
@@ -114,15 +117,17 @@ class ToyRobot(RobotSide):
 
 
 async def simulate(simulation: Simulation) -> None:
-    """Be a robot that moves along x."""
-    place, speed = [0.0, 0.0], [0.0, 0.0]
+    """Be a robot on a plane."""
+    place, speed = [0.0, 0.0, 0.0], [0.0, 0.0]
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         listening = asyncio.create_task(listen(reader))
         with contextlib.suppress(ConnectionError):
             while not listening.done():
-                place[:] = place[0] + speed[0] / 10, place[1] + speed[1] / 10
-                writer.write(b"at %f 0 %f\n" % (place[0], place[1]))
+                x, y, heading = place
+                ahead, heading = speed[0] / 10, heading + speed[1] / 10
+                place[:] = x + ahead * math.cos(heading), y + ahead * math.sin(heading), heading
+                writer.write(b"at %f %f %f\n" % tuple(place))
                 await writer.drain()
                 await asyncio.sleep(0.1)
         writer.close()

@@ -1,8 +1,9 @@
 """Khepera: a small robot with two wheels, eight proximity sensors and LEDs, on a serial line or TCP."""
 
-from khepera.messages import LINES
+from khepera.messages import LINES, Positions, Proximity, SetLed, SetSpeeds, Speeds, Version
 from khepera.translate import KheperaRobot, Options
-from zbridge.protocol import Codec, Protocol, Simulation
+from zbridge.fleet.messages import Drive
+from zbridge.protocol import Codec, Example, Protocol, Simulation
 
 TEMPLATE = """\
 [device]
@@ -22,6 +23,17 @@ async def _simulate(simulation: Simulation) -> None:
     await simulate(simulation)
 
 
+MANUAL = "Khepera manual, appendix A"
+EXAMPLES = (
+    Example("lines", b"D,10,-10\n", SetSpeeds(10, -10), source=MANUAL),
+    Example("lines", b"D,25,25\n", SetSpeeds(25, 25), command=Drive(forward=0.4), source="25 * 8 mm/s is 0.2 m/s"),
+    Example("lines", b"L,0,1\n", SetLed(0, 1), source=MANUAL),
+    Example("lines", b"b,5,1\n", Version(5, 1), source=MANUAL),
+    Example("lines", b"e,25,25\n", Speeds(25, 25), {"motion.speed": 0.4}, source=MANUAL),
+    Example("lines", b"h,-100,2147483647\n", Positions(-100, 2**31 - 1), source=MANUAL),
+    Example("lines", b"n,0,1,2,3,4,5,6,1023\n", Proximity(0, 1, 2, 3, 4, 5, 6, 1023), source=MANUAL),
+)
+
 PROTOCOL = Protocol(
     name="khepera",
     summary="Khepera: two wheels, eight proximity sensors",
@@ -31,4 +43,5 @@ PROTOCOL = Protocol(
     simulate=_simulate,
     template=TEMPLATE,
     codecs=(Codec("lines", LINES.write, LINES.read, LINES.end, LINES.messages),),
+    examples=EXAMPLES,
 )

@@ -21,7 +21,7 @@ from khepera.messages import (
     SpeedsSet,
     Version,
 )
-from khepera.translate import BEARINGS_DEG, DISTANCE_M, LIGHT, PULSE_M, UNIT_M_S, WRAP
+from khepera.translate import BEARINGS_DEG, DISTANCE_M, LIGHT, PULSE_M, STILL, UNIT_M_S, WRAP
 from zbridge.protocol import ProtocolError, Simulation, Truth
 from zbridge.simulation import SimulatedRobot, serve
 from zbridge.simulation.world import Body, cast
@@ -32,7 +32,6 @@ SILENCE_S = 1.0
 TRACK_M, RADIUS_M = 0.053, 0.0275
 LONGEST = 128
 _ANGLES = np.radians(list(BEARINGS_DEG.values()))
-_STILL = SetSpeeds(0, 0)
 
 
 class Khepera(SimulatedRobot):
@@ -40,7 +39,7 @@ class Khepera(SimulatedRobot):
 
     def __init__(self, place: tuple[float, float, float] | None = None, *, at_wrap: bool = False) -> None:
         self.body = Body.placed(place, radius=RADIUS_M)
-        self.speeds = _STILL
+        self.speeds = STILL
         self.leds: dict[int, bool] = {}
         self._pulses = [float(WRAP // 2 - 100 if at_wrap else 0)] * 2
         self._lines = FrameBuffer(LINES.end, LONGEST)
@@ -57,7 +56,7 @@ class Khepera(SimulatedRobot):
     def step(self, dt: float) -> bytes:
         self._silent_s += dt
         if self._silent_s > SILENCE_S:
-            self.speeds = _STILL
+            self.speeds = STILL
         left, right = self._speeds_m_s()
         self._pulses[0] += left * dt / PULSE_M
         self._pulses[1] += right * dt / PULSE_M
@@ -66,8 +65,8 @@ class Khepera(SimulatedRobot):
 
     def truth(self) -> Truth:
         wraps = sum(pulses >= WRAP // 2 for pulses in self._pulses)
-        neutral = self.speeds == _STILL
-        return Truth(self.body.x, self.body.y, self.body.heading, self._speeds_m_s(), neutral, wraps)
+        neutral, silent = self.speeds == STILL, self._silent_s > SILENCE_S
+        return Truth(self.body.x, self.body.y, self.body.heading, self._speeds_m_s(), neutral, wraps, silent)
 
     def _speeds_m_s(self) -> tuple[float, float]:
         return self.speeds.left * UNIT_M_S, self.speeds.right * UNIT_M_S

@@ -5,7 +5,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from khepera.messages import Positions, Proximity, SetLed, SetSpeeds, Speeds
+from khepera.messages import LINES, Positions, Proximity, SetLed, SetSpeeds, Speeds
 from khepera.session import KheperaSession
 from zbridge import protocol
 from zbridge.fleet import topics
@@ -14,6 +14,7 @@ from zbridge.fleet.topics import Topic
 
 UNIT_M_S, MOST_UNITS, PULSE_M, WRAP = 0.008, 127, 0.00008, 2**32
 AGAIN_S, STOP_AGAIN_S = 0.5, 0.1
+STILL = SetSpeeds(0, 0)
 BEARINGS_DEG = dict(zip(Proximity.__struct_fields__, (-150, -85, -45, -15, 15, 45, 85, 150), strict=True))
 RANGE_M = (0.005, 0.06)
 LIGHT, DISTANCE_M = [20, 60, 150, 350, 700, 1023], [0.06, 0.05, 0.035, 0.02, 0.01, 0.005]
@@ -81,7 +82,10 @@ class KheperaRobot(protocol.RobotSide):
         return protocol.Outcome(left_out=left_out)
 
     def stop(self, now: float, until: float) -> None:
-        self._drive(SetSpeeds(0, 0), now, period_s=STOP_AGAIN_S, until=until, urgent=True)
+        self._drive(STILL, now, period_s=STOP_AGAIN_S, until=until, urgent=True)
+
+    def stop_frames(self) -> tuple[bytes, ...]:
+        return (LINES.write(STILL),)
 
     def ask(self, topic: Topic) -> None:
         raise protocol.Unsupported(f"a Khepera cannot be queried for its {topic.path}")

@@ -20,7 +20,7 @@ from zbridge.simulation import STEP_S, Scene
 
 @pytest.fixture
 def scene() -> Scene:
-    """A gateway's robot and the simulated one, established."""
+    """Connect a gateway's robot and a simulated one."""
     scene = Scene(PROTOCOL, Khepera())
     scene.run(1.2)  # the stop that greets the robot is over
     assert scene.session.state is State.ESTABLISHED

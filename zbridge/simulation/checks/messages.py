@@ -13,28 +13,39 @@ import numpy as np
 
 from zbridge.errors import EncodeError, ProtocolError, describe
 from zbridge.protocol.plugin import Codec, Protocol
-from zbridge.simulation.check_stage import CheckFinding, raised
-from zbridge.wire import Whole
+from zbridge.simulation.checks.finding import CheckFinding, raised
+from zbridge.wire import Counted, Whole
 from zbridge.wire.fields import CountedArray, Filling
 from zbridge.wire.frames import FrameBuffer, FramingFault
 
 MOST_BYTES = 2**20
 RANDOM_CASES = 500
 RANDOM_BYTES = 60
+DAMAGED_CASES = 60
 
 
 def check_messages(protocol: Protocol) -> Iterator[CheckFinding]:
     """Check every codec of a protocol."""
     if not protocol.codecs:
-        yield CheckFinding("messages are declared", "Protocol.codecs is empty: nothing can be checked")
+        problem = "Protocol.codecs is empty: nothing can be checked"
+        yield CheckFinding("messages are declared", problem, guide="8. The protocol")
     for codec in protocol.codecs:
-        messages, problems = _examples(codec)
-        frames = _frames(codec, messages, problems)
-        yield CheckFinding.of(f"{codec.name}: {len(codec.messages)} messages round-trip", problems)
-        yield CheckFinding.of(f"{codec.name}: whole, byte by byte and joined give the same", _cuts(codec, frames))
-        cut_off = [frame[:size] for frame in frames for size in range(1, len(frame))]
-        yield CheckFinding.of(f"{codec.name}: what is cut off is a message or a ProtocolError", _fed(codec, cut_off))
-        yield CheckFinding.of(f"{codec.name}: random bytes are a message or a ProtocolError", _random(codec, frames))
+        yield from _check_codec(codec, codec.name)
+
+
+def _check_codec(codec: Codec, name: str) -> Iterator[CheckFinding]:
+    messages, problems = _examples(codec)
+    frames = _frames(codec, messages, problems)
+    guide = "2. Messages"
+    yield CheckFinding.of(f"{name}: {len(codec.messages)} messages round-trip", problems, guide=guide)
+    claim = f"{name}: whole, byte by byte and joined give the same"
+    yield CheckFinding.of(claim, _cuts(codec, frames), guide=guide)
+    cut_off = [frame[:size] for frame in frames for size in range(1, len(frame))]
+    claim = f"{name}: what is cut off is a message or a ProtocolError"
+    yield CheckFinding.of(claim, _fed(codec, cut_off), guide=guide)
+    claim = f"{name}: random bytes are a message or a ProtocolError"
+    yield CheckFinding.of(claim, _fed(codec, _noise(frames)), guide=guide)
+    yield _damaged(codec, frames)
 
 
 def example(declared: type) -> Any:
@@ -62,6 +73,8 @@ def _value(hint: Any) -> Any:
         items = next((mark.dtype for mark in marks if isinstance(mark, CountedArray | Filling)), None)
         if items is not None:
             return np.array([1, 2], items)
+        if any(isinstance(mark, Counted) for mark in marks):
+            return (example(get_args(hint)[0]),) * 2
     if get_origin(hint) is types.UnionType:
         hint = get_args(hint)[0]
     if hint is int and whole is not None:
@@ -89,9 +102,9 @@ def _frames(codec: Codec, messages: list[Any], problems: list[str]) -> list[byte
             again = codec.read(frame)
             frames.append(frame)
             if not _same(message, again):
-                problems.append(f"{message} was read as {again}")
+                problems.append(f"{message} is written as {frame!r}, which is read as {again}")
             elif codec.write(again) != frame:
-                problems.append(f"{message} is written as {frame!r}, and as {codec.write(again)!r} once read")
+                problems.append(f"{message} is written as {frame!r}, and once read as {codec.write(again)!r}")
         except Exception as error:  # whatever the protocol's own code raises is a finding
             problems.append(f"{message}: {raised(error, 'a frame, and the same message of it')}")
     return frames
@@ -130,16 +143,44 @@ def _try(problems: list[str], what: str, cut: Callable[[], list[bytes]], expecte
         problems.append(f"{what} is cut to {found!r}, expected {expected!r}")
 
 
-def _random(codec: Codec, frames: list[bytes]) -> list[str]:
-    """Feed noise, and messages of which one byte was changed."""
+def _noise(frames: list[bytes]) -> list[bytes]:
+    """Make noise, and messages of which one byte was changed."""
     rng = random.Random(1)
     noise = [rng.randbytes(rng.randint(1, RANDOM_BYTES)) for _ in range(RANDOM_CASES)]
-    changed = []
-    for frame in frames:
-        for _ in range(20):
-            place = rng.randrange(len(frame))
-            changed.append(frame[:place] + rng.randbytes(1) + frame[place + 1 :])
-    return _fed(codec, noise + changed)
+    return noise + [_changed(frame, rng, 1) for frame in frames for _ in range(20)]
+
+
+def _changed(frame: bytes, rng: random.Random, places: int) -> bytes:
+    data = bytearray(frame)
+    for _ in range(places):
+        data[rng.randrange(len(data))] = rng.randrange(256)
+    return bytes(data)
+
+
+def _damaged(codec: Codec, frames: list[bytes]) -> CheckFinding:
+    """Read messages whose fields were damaged, and whose count and checksum fit again."""
+    claim = f"{codec.name}: any fields behind a right checksum are a message or a ProtocolError"
+    guide, rng = "8. The protocol", random.Random(2)
+    seal = codec.seal or getattr(getattr(codec.frame_end, "__self__", None), "seal", None)
+    read, problems = 0, dict[str, str]()
+    for frame in [frame for frame in frames for _ in range(DAMAGED_CASES)]:
+        damaged = _changed(frame, rng, rng.randint(1, 4))
+        if seal is not None and rng.random() < 0.5:  # too long, or too short
+            damaged = damaged[: rng.randint(len(frame) // 2, len(frame))] + rng.randbytes(rng.choice((0, 3)))
+        try:
+            codec.write(codec.read(damaged if seal is None else seal(damaged)))
+            read += 1
+        except EncodeError:
+            read += 1
+        except ProtocolError:
+            continue
+        except Exception as error:  # whatever the protocol's own code raises is a finding
+            problems.setdefault(describe(error), f"{damaged!r}: {raised(error, 'a message or ProtocolError')}")
+    if problems or read or not frames:
+        return CheckFinding.of(claim, list(problems.values()), guide=guide)
+    if seal is not None:
+        return CheckFinding(claim, "no damaged frame is read: Codec.seal does not make it whole", guide=guide)
+    return CheckFinding.not_checked(claim, "no damaged frame is read: give Codec.seal, which computes checksums", guide)
 
 
 def _fed(codec: Codec, streams: list[bytes]) -> list[str]:

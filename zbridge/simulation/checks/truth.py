@@ -1,0 +1,127 @@
+"""What a robot showed on one leg of its way, and how it really moved; what of it contradicts what is expected."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Protocol
+
+import msgspec
+
+from zbridge.errors import Refused
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Drive, Pose
+from zbridge.protocol import plugin
+from zbridge.protocol.plugin import Truth
+from zbridge.simulation.checks.stage import Stage
+
+STEADY_S = 0.4
+"""Seconds at the end of a drive in which the speed no longer changes."""
+SCALE = 0.15
+"""Tolerance of a true speed against the options: robots count in whole units."""
+SHOWN_SCALE = 0.1
+"""Tolerance of what is shown against the truth."""
+NO_TRUTH = "the simulated robot reports no truth (Simulation.report)"
+
+
+class Placed(Protocol):
+    """A pose, shown or true."""
+
+    x: float
+    y: float
+    heading: float
+
+
+class Way(NamedTuple):
+    """A way in the axes at its beginning: metres ahead and to the left, radians counter-clockwise."""
+
+    ahead_m: float
+    aside_m: float
+    turned_rad: float
+
+    @classmethod
+    def between(cls, begin: Any, end: Any) -> Way:
+        """Measure the way from one pose to another."""
+        x, y, cos, sin = end.x - begin.x, end.y - begin.y, math.cos(begin.heading), math.sin(begin.heading)
+        turned_rad = math.remainder(end.heading - begin.heading, 2 * math.pi)
+        return cls(x * cos + y * sin, y * cos - x * sin, turned_rad)
+
+    @property
+    def far_m(self) -> float:
+        return math.hypot(self.ahead_m, self.aside_m)
+
+
+class Leg(msgspec.Struct, frozen=True, kw_only=True):
+    """A drive, and how it ended. shown: None where no pose is shown. true: None where the simulator does not say.
+
+    steady_m_s, steady_rad_s: the true speed and turn rate at the end of the drive. wheels_m_s: as of :class:`Truth`,
+    then. speeds: what ``motion`` showed at the end of the drive. refused: the code, if the drive was refused.
+    """
+
+    seconds: float
+    shown: Way | None
+    true: Way | None
+    steady_m_s: float = 0.0
+    steady_rad_s: float = 0.0
+    wheels_m_s: tuple[float, ...] = ()
+    speeds: tuple[float, ...] = ()
+    written: frozenset[bytes] = frozenset()
+    refused: str | None = None
+
+
+async def leg(
+    stage: Stage, seconds: float, stand_s: float, *, forward: float = 0.0, turn: float = 0.0, stop: bool = True
+) -> Leg:
+    """Drive for so long, end with a stop or with neutral, and wait until the robot stands."""
+    pose, truth, begun = _last(stage.poses), stage.truth, stage.now()
+    stage.forget()
+    refused = None
+    try:
+        await stage.drive(seconds, forward, turn)
+    except Refused as refusal:
+        refused = str(refusal.code)
+    ended, speeds, written = stage.now(), tuple(stage.speeds[-3:]), frozenset(stage.written)
+    steady = [entry for entry in stage.truths if ended - STEADY_S <= entry[0] <= ended]
+    if stop:
+        await stage.stop(stand_s)
+    else:
+        stage.robot.command(topics.CMD_DRIVE, Drive(), stage.now())
+        await stage.watch(stand_s)
+    steady_m_s, steady_rad_s = _rates(steady)
+    after, true = _last(stage.poses), stage.truth
+    return Leg(
+        seconds=ended - begun,
+        shown=Way.between(pose, after) if pose is not None and after is not None else None,
+        true=Way.between(truth, true) if truth is not None and true is not None else None,
+        steady_m_s=steady_m_s,
+        steady_rad_s=steady_rad_s,
+        wheels_m_s=steady[-1][1].wheels_m_s if steady else (),
+        speeds=speeds,
+        written=written,
+        refused=refused,
+    )
+
+
+def _last(poses: Sequence[Pose]) -> Pose | None:
+    return poses[-1] if poses else None
+
+
+def _rates(truths: Sequence[tuple[float, Truth]]) -> tuple[float, float]:
+    """Return the mean speed ahead, m/s, and the mean turn rate, rad/s."""
+    if len(truths) < 2 or truths[-1][0] <= truths[0][0]:
+        return 0.0, 0.0
+    seconds, way = truths[-1][0] - truths[0][0], Way.between(truths[0][1], truths[-1][1])
+    return math.copysign(way.far_m, way.ahead_m) / seconds, way.turned_rad / seconds
+
+
+def full_scale(protocol: plugin.Protocol, *names: str) -> float:
+    """Return full scale according to the options, also within one of their tables; 0 if they do not state it."""
+    options = msgspec.convert(protocol.simulated, protocol.options)
+    tables = [options, *(getattr(options, name) for name in options.__struct_fields__)]
+    found = (getattr(table, name, None) for table in tables if isinstance(table, msgspec.Struct) for name in names)
+    return next((value for value in found if isinstance(value, float)), 0.0)
+
+
+def unlike(seen: float, expected: float, within: float) -> bool:
+    """Return whether a number differs from what is expected by more than this part of it."""
+    return abs(seen - expected) > abs(expected) * within

@@ -9,11 +9,13 @@ from zbridge import protocol
 from zbridge.fleet import topics
 
 DOCS = Path(__file__).parents[2] / "docs"
-EXAMPLE = DOCS / "examples" / "khepera"
+EXAMPLE, SECOND = DOCS / "examples" / "khepera", DOCS / "examples" / "arcos"
 GUIDE = (DOCS / "how-to" / "add-a-protocol.md").read_text()
 LISTINGS = re.findall(r'^```(?:python|toml)(?: title="(\S+)")?\n(.*?)^```$', GUIDE, re.DOTALL | re.MULTILINE)
 FILES = ("pyproject.toml", *(str(path.relative_to(EXAMPLE)) for path in sorted((EXAMPLE / "khepera").glob("*.py"))))
-MOST_LINES = 250
+SHOWN = ("arcos/messages.py", "arcos/session.py")
+"""Files of the second example of which the guide shows parts."""
+MOST_LINES, MOST_OF_SECOND = 270, 300
 
 
 def lines(text: str) -> list[str]:
@@ -26,8 +28,15 @@ def test_the_listings_of_a_file_put_together_are_the_file(file: str) -> None:
     assert shown == lines((EXAMPLE / file).read_text())
 
 
+@pytest.mark.parametrize("file", SHOWN)
+def test_a_listing_of_the_second_example_is_a_part_of_its_file(file: str) -> None:
+    listings = [listing for name, listing in LISTINGS if name == file]
+    assert listings
+    assert [listing for listing in listings if listing not in (SECOND / file).read_text()] == []
+
+
 def test_every_listing_is_of_a_file_or_is_run() -> None:
-    assert {name for name, _ in LISTINGS} == {*FILES, ""}
+    assert {name for name, _ in LISTINGS} == {*FILES, *SHOWN, ""}
     assert len(re.findall(r"^```(?:python|toml)", GUIDE, re.MULTILINE)) == len(LISTINGS)
 
 
@@ -37,9 +46,10 @@ def test_a_listing_of_no_file_runs(program: str) -> None:
 
 
 def test_the_protocol_takes_no_more_lines_than_the_guide_says() -> None:
-    files = [path for path in (EXAMPLE / "khepera").glob("*.py") if path.name != "simulator.py"]
-    assert sum(len(path.read_text().splitlines()) for path in files) <= MOST_LINES
-    assert f"{MOST_LINES} lines" in GUIDE
+    for folder, most in ((EXAMPLE / "khepera", MOST_LINES), (SECOND / "arcos", MOST_OF_SECOND)):
+        files = [path for path in folder.glob("*.py") if path.name != "simulator.py"]
+        assert sum(len(path.read_text().splitlines()) for path in files) <= most
+        assert f"{most} lines" in GUIDE
 
 
 def test_every_name_that_the_guide_imports_from_the_package_for_authors_is_there() -> None:

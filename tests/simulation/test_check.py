@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import re
+import time
 from collections.abc import Callable, Iterable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -15,6 +17,7 @@ from tests.e2e.other_package import toyrobot as toy
 from zbridge.errors import ConfigError
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, Switch
+from zbridge.protocol.address import Address
 from zbridge.protocol.plugin import Outcome, Protocol, Simulation
 from zbridge.protocol.session import Session
 from zbridge.simulation import check as kit
@@ -412,3 +415,55 @@ def test_a_wrong_command_line_is_a_clear_error(capsys, arguments: list[str], sta
     assert kit.main(arguments) == status
     printed = capsys.readouterr()
     assert said in (printed.err if status else printed.out)
+
+
+# What helps
+
+
+async def raises_later(simulation: Simulation) -> None:
+    """Be a robot that raises an exception for its first client."""
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.read(1)
+        {}["it"]
+
+    async with await asyncio.start_server(serve, "127.0.0.1", 0) as server:
+        simulation.ready((Address(*server.sockets[0].getsockname()[:2]),))
+        await server.serve_forever()
+
+
+async def ends_at_once(simulation: Simulation) -> None:
+    simulation.ready((Address("127.0.0.1", 1),))
+
+
+def never_established(self: Any, now: float) -> None:
+    self.send(toy.At(0, 0, 0))
+
+
+@pytest.mark.parametrize(
+    ("simulate", "problem"),
+    [
+        (raises_later, "the simulated robot raised KeyError: 'it' in serve (test_check.py:"),
+        (ends_at_once, "Connect call failed"),
+    ],
+)
+def test_what_the_simulated_robot_raises_is_told_at_once(simulate: Any, problem: str) -> None:
+    begun = time.monotonic()
+    protocol = msgspec.structs.replace(with_session(opened=never_established), simulate=simulate)
+    assert_found(kit.check(protocol, "toy"), {ESTABLISHED: problem})
+    assert time.monotonic() - begun < 5.0  # not after the 10 s that a handshake may take
+
+
+GUIDE = (Path(__file__).parents[2] / "docs" / "how-to" / "add-a-protocol.md").read_text()
+
+
+def test_the_guide_has_every_paragraph_that_a_finding_names() -> None:
+    folder = Path(kit.__file__).parent
+    sources = [path.read_text() for path in (folder / "check.py", *(folder / "checks").glob("*.py"))]
+    named = {name for source in sources for name in re.findall(r'"(\d\. [A-Z][^"]*)"', source)}
+    assert len(named) > 8
+    for name in named:
+        step, _, paragraph = name.partition(": ")
+        section = GUIDE.partition(f"\n## {step}\n")[2].partition("\n## ")[0]
+        assert section, step
+        assert not paragraph or f"**{paragraph}" in section, name

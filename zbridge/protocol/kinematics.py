@@ -37,15 +37,19 @@ class Differential(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     speed_full_m_s: Positive = 0.5
     turn_full_rad_s: Positive = 1.0
 
-    def sides_m_s(self, drive: Drive) -> tuple[float, float]:
-        """Return the speeds of the left and the right side over ground, m/s.
+    def velocity(self, drive: Drive) -> tuple[float, float]:
+        """Return the speed ahead, m/s, and the turn rate, rad/s, counter-clockwise.
 
         Raise Unsupported for a drive that only moves sideways; a sideways part beside others is left out.
         """
         if drive.left and not (drive.forward or drive.turn):
             raise Unsupported("left: a robot with two sides of wheels does not move sideways")
-        along_m_s = drive.forward * self.speed_full_m_s
-        across_m_s = drive.turn * self.turn_full_rad_s * self.track_m / 2
+        return drive.forward * self.speed_full_m_s, drive.turn * self.turn_full_rad_s
+
+    def sides_m_s(self, drive: Drive) -> tuple[float, float]:
+        """Return the speeds of the left and the right side over ground, m/s; raise Unsupported as :meth:`velocity`."""
+        along_m_s, turn_rad_s = self.velocity(drive)
+        across_m_s = turn_rad_s * self.track_m / 2
         return along_m_s - across_m_s, along_m_s + across_m_s
 
     def drive(self, left_m_s: float, right_m_s: float) -> Drive:

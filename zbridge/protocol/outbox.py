@@ -17,7 +17,8 @@ Four places for frames. ``take`` serves them in this order:
 
 Fairness: the slot that has been due longest goes first; slots and queue take turns frame by frame, so that neither
 a stream of motion nor a full queue starves the other. A group that replaces one of the same length continues at the
-position of the old one: if a group of motors is replaced faster than it is written, each motor is still served.
+position of the old one, and is sent whole from there: if a group of motors is replaced faster than it is written, each
+motor is still served.
 
 The slot :data:`KEEP_ALIVE` is sent while the outbox is muted, too, and nothing but :meth:`Outbox.clear` empties it.
 
@@ -53,13 +54,15 @@ class _Group(msgspec.Struct):
     until: float
     spacing_s: float = 0.0
     position: int = 0
+    sent: int = 0
+    """Frames of this round that have left."""
 
     def step(self, now: float) -> bytes:
         """Return the next frame of the group."""
         frame = self.frames[self.position]
-        self.position += 1
-        if self.position == len(self.frames):
-            self.position = 0
+        self.position, self.sent = (self.position + 1) % len(self.frames), self.sent + 1
+        if self.sent == len(self.frames):
+            self.position = self.sent = 0
             self.due = now + self.period_s
         elif self.spacing_s:
             self.due = now + self.spacing_s
@@ -68,7 +71,7 @@ class _Group(msgspec.Struct):
     @property
     def over(self) -> bool:
         """Whether the group is sent whole and not due again."""
-        return self.position == 0 and (self.due > self.until or self.due == math.inf)
+        return self.sent == 0 and (self.due > self.until or self.due == math.inf)
 
 
 class Outbox(Kept):
@@ -274,5 +277,5 @@ def _write_slots(slots: dict[str, _Group]) -> list[Any]:
 def _read_slots(raw: list[Any]) -> dict[str, _Group]:
     slots = {}
     for slot, frames, position, due, period_s, until, spacing_s in raw:
-        slots[slot] = _Group(FRAMES.read(frames), due, period_s, until, spacing_s, position)
+        slots[slot] = _Group(FRAMES.read(frames), due, period_s, until, spacing_s, position, sent=position)
     return slots

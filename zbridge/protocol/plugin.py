@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 
 import msgspec
 
-from zbridge.errors import ConfigError, Unsupported, describe
+from zbridge.errors import ConfigError, NotReady, Unsupported, describe
 from zbridge.fleet.messages import Drive, FleetMessage, Motor
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
@@ -137,6 +137,13 @@ class RobotSide(Kept, ABC):
     def begun(self, stamp_ns: int) -> tuple[Telemetry, ...]:
         """Start with a newly established connection; return the telemetry that is known at once."""
         return ()
+
+    def connected(self) -> Session[Any]:
+        """Return the session that takes commands, once it is established; raise NotReady before."""
+        session = self.driving
+        if session is None or session.state is not State.ESTABLISHED:
+            raise NotReady("offline")
+        return session
 
     @property
     def ready(self) -> bool:

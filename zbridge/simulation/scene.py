@@ -16,6 +16,9 @@ from zbridge.protocol.plugin import Outcome, Protocol, RobotSide
 from zbridge.protocol.session import Session, State
 from zbridge.simulation.simulated import STEP_S, SimulatedRobot
 
+PEER = "tcp://robot.test:1"
+STOPPED_S = 1.0
+"""Seconds for which the gateway repeats a stop."""
 _NS_PER_S = 1_000_000_000
 
 
@@ -26,8 +29,9 @@ class Scene:
     """
 
     def __init__(self, protocol: Protocol, simulated: SimulatedRobot, options: dict[str, Any] | None = None) -> None:
-        chosen = msgspec.convert(protocol.simulated if options is None else options, protocol.options)
-        self.robot: RobotSide = protocol.robot(chosen, 1, Metrics())
+        self._protocol = protocol
+        self._options = msgspec.convert(protocol.simulated if options is None else options, protocol.options)
+        self.robot: RobotSide = protocol.robot(self._options, 1, Metrics())
         self.simulated = simulated
         self.session: Session[Any]
         """The conversation; :meth:`connect` makes a new one."""
@@ -48,10 +52,32 @@ class Scene:
         """Connect, for the first time or anew; the connection before is lost."""
         if self.robot.driving is not None:
             self.robot.driving.fail("closed by peer")
-        self.session = self.robot.session(self.robot.link_names[0], "tcp://robot.test:1")
+        self.session = self.robot.session(self.robot.link_names[0], PEER)
         self._greeted = False
         self.session.open(self.now)
         self._hear(self.simulated.connected())
+
+    def establish(self, within_s: float = 10.0) -> None:
+        """Let time pass until the session is established, and the stop that follows is over; raise TimeoutError."""
+        until = self.now + within_s
+        while self.session.state is not State.ESTABLISHED:
+            if self.session.over or self.now >= until:
+                raise TimeoutError(f"{self.session!r} after {self.now:g} s")
+            self.run(STEP_S)
+        self.run(STOPPED_S + STEP_S)
+
+    def lease(self, on: bool) -> None:
+        """Tell the robot side that a program has taken the lease, or that nobody has it any more."""
+        self.robot.leased(on, self.now)
+
+    def restart(self) -> None:
+        """Let another process of the gateway take the connection over (``hands_over``)."""
+        state = msgspec.msgpack.encode((self.robot.export(), self.session.export()))
+        robot, session = msgspec.msgpack.decode(state)
+        self.robot = self._protocol.robot(self._options, 1, Metrics())
+        self.session = self.robot.session(self.robot.link_names[0], PEER)
+        self.session.restore(session)
+        self.robot.restore(robot)
 
     def run(self, seconds: float) -> None:
         """Let time pass."""
@@ -72,7 +98,7 @@ class Scene:
         """Command the robot as the gateway does; raise Refused where the robot is not ready, or refuses."""
         return self.robot.command(topic, command, self.now)
 
-    def stop(self, repeated_s: float = 1.0) -> None:
+    def stop(self, repeated_s: float = STOPPED_S) -> None:
         """Stop the robot, as the gateway does."""
         self.robot.stop(self.now, self.now + repeated_s)
 

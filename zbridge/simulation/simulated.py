@@ -7,12 +7,14 @@ Knows no protocol. The gateways of this package simulate several clients and lin
 from __future__ import annotations
 
 import asyncio
-import contextlib
+import logging
 from abc import ABC, abstractmethod
 
-from zbridge.errors import ConfigError
+from zbridge.errors import ConfigError, ProtocolError
 from zbridge.protocol.address import Address
 from zbridge.protocol.plugin import Simulation, Truth
+
+log = logging.getLogger(__name__)
 
 STEP_S = 0.01
 """Seconds between two steps of a simulated robot."""
@@ -57,19 +59,30 @@ async def serve(simulation: Simulation, robot: SimulatedRobot) -> None:
     (address,), writers = simulation.addresses, set[asyncio.StreamWriter]()
 
     async def serve_client(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if not writers:
-            writers.add(writer)
+        if writers:
+            writer.close()
+            return
+        writers.add(writer)
+        try:
             writer.write(robot.connected())
-            with contextlib.suppress(ConnectionError):
-                while data := await reader.read(_READ):
-                    writer.write(robot.receive(data))
-                    await writer.drain()
+            while data := await reader.read(_READ):
+                writer.write(robot.receive(data))
+                await writer.drain()
+        except ConnectionError:
+            pass
+        except ProtocolError as error:  # what it was sent can be no frame
+            log.debug("the client is closed: %s", error)
+        finally:
             writers.discard(writer)
-        writer.close()
+            writer.close()
 
     async with await asyncio.start_server(serve_client, address.host, address.port) as server:
         simulation.ready((Address(*server.sockets[0].getsockname()[:2]),))
-        await _live(simulation, robot, writers)
+        try:
+            await _live(simulation, robot, writers)
+        finally:
+            for writer in writers:
+                writer.close()  # its task ends by itself, and is not cancelled
 
 
 async def _live(simulation: Simulation, robot: SimulatedRobot, writers: set[asyncio.StreamWriter]) -> None:

@@ -37,14 +37,14 @@ class Packets:
     def __init__(self, head: bytes, count: str, *, uncounted: int, checksum: Checksum, most: int) -> None:
         self._head, self._count = head, struct.Struct(count)
         self._body_at = len(head) + self._count.size
-        self._uncounted, self._checksum = uncounted, checksum
+        self._uncounted, self._checksum, self.most = uncounted, checksum, most
         self._sum_bytes = len(checksum(head + bytes(self._count.size)))
-        self._least, self._most = self._body_at + self._sum_bytes, most
+        self._least = self._body_at + self._sum_bytes
         if not head or most < self._least:
             raise ValueError(f"head {head!r}, most {most}: expected a byte or more, and {self._least} or more")
 
     def __repr__(self) -> str:
-        return f"<Packets {self._head!r} {self._count.format}, {self._most} bytes at most>"
+        return f"<Packets {self._head!r} {self._count.format}, {self.most} bytes at most>"
 
     def end(self, data: bytes, start: int) -> int:
         """Find where the packet, or the noise, that begins at ``start`` ends; beyond ``data`` while that is unknown."""
@@ -54,7 +54,7 @@ class Packets:
         if start + self._body_at > len(data):
             return start + self._body_at
         end = start + self._size(data, start)
-        if not self._least <= end - start <= self._most:
+        if not self._least <= end - start <= self.most:
             return self._noise_end(data, start)
         return end if end > len(data) or self._is_sound(data[start:end]) else self._noise_end(data, start)
 
@@ -77,8 +77,8 @@ class Packets:
             count = self._count.pack(size - self._uncounted)
         except struct.error as error:
             raise EncodeError(f"a packet of {size} bytes: {error}") from error
-        if size > self._most:
-            raise EncodeError(f"a packet of {size} bytes, expected {self._most} at most")
+        if size > self.most:
+            raise EncodeError(f"a packet of {size} bytes, expected {self.most} at most")
         begun = self._head + count + body
         return begun + self._checksum(begun)
 
@@ -99,7 +99,7 @@ class Packets:
         if found < 0:
             sizes = range(min(len(self._head) - 1, len(data) - start - 1), 0, -1)
             found = len(data) - next((size for size in sizes if data.endswith(self._head[:size])), 0)
-        return min(found, start + self._most)
+        return min(found, start + self.most)
 
 
 def _shown(frame: bytes) -> str:

@@ -236,11 +236,12 @@ async def record(protocol: Protocol, establish_s: float) -> Transcript:
     """Run the conversations until a while after all links are established; record them."""
     async with live(protocol) as stage:
         established = await stage.established(establish_s)
+        handshake = len(stage.frames)
         if established:
             await stage.watch(SHOWN_S)
         return Transcript(
             [frame for direction, frame in stage.frames if direction == "in"][:_MOST_FRAMES],
-            _answers(stage.frames),
+            _answers(stage.frames[handshake:]),
             list(stage.messages),
             established,
             None if established else "; ".join(stage.lacking(establish_s)),

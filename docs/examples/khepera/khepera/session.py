@@ -12,7 +12,7 @@ class KheperaSession(ExchangeSession[Line]):
     """The gateway sends requests, the robot answers."""
 
     role = Role.HQ
-    frame_end, encode, read = staticmethod(LINES.end), staticmethod(LINES.write), staticmethod(LINES.read)
+    frame_end, encode, read = staticmethod(LINES.end), LINES.write, LINES.read
 
     def answers(self, request: bytes, message: Line) -> bool:
         return message.word == request[:1].lower()

@@ -31,22 +31,18 @@ class KheperaRobot(protocol.RobotSide):
     """One Khepera on one link."""
 
     link_names = ("robot",)
+    driving: KheperaSession | None = None
     accepts = ("drive", "light")
 
     def __init__(self, options: Options, links: int = 1, metrics: protocol.Metrics | None = None) -> None:
         self.options = options
-        self._session: KheperaSession | None = None
         self._scan = protocol.BearingScan(BEARINGS_DEG, RANGE_M)
         self._odometry = protocol.Odometry(options.track_m, unit_m=PULSE_M, wrap=WRAP)
 
     def session(self, link: str, peer: str) -> KheperaSession:
-        self._session = KheperaSession(protocol.Limits(frame_bytes=128, handshake_s=5.0))
+        self.driving = KheperaSession(protocol.Limits(frame_bytes=128, handshake_s=5.0))
         self._odometry.restart()
-        return self._session
-
-    @property
-    def driving(self) -> KheperaSession | None:
-        return self._session
+        return self.driving
 
     # What the robot sends
 
@@ -78,7 +74,7 @@ class KheperaRobot(protocol.RobotSide):
         else:
             raise protocol.Unsupported(f"a Khepera has no {topic.path}")
         if light is not None:
-            self._connected().send(SetLed(0, int(light)))
+            self.connected().send(SetLed(0, int(light)))
         return protocol.Outcome(left_out=left_out)
 
     def stop(self, now: float, until: float) -> None:
@@ -91,13 +87,8 @@ class KheperaRobot(protocol.RobotSide):
         raise protocol.Unsupported(f"a Khepera cannot be queried for its {topic.path}")
 
     def _drive(self, speeds: SetSpeeds, now: float, **how: Any) -> None:
-        session = self._connected()
+        session = self.connected()
         session.outbox.set("drive", (session.encode(speeds),), now, **how)
-
-    def _connected(self) -> KheperaSession:
-        if self._session is None or self._session.over:
-            raise protocol.NotReady("offline")
-        return self._session
 
 
 def _speeds(left_m_s: float, right_m_s: float) -> SetSpeeds:

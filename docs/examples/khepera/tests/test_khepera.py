@@ -22,8 +22,7 @@ from zbridge.simulation import STEP_S, Scene
 def scene() -> Scene:
     """Connect a gateway's robot and a simulated one."""
     scene = Scene(PROTOCOL, Khepera())
-    scene.run(1.2)  # the stop that greets the robot is over
-    assert scene.session.state is State.ESTABLISHED
+    scene.establish()
     return scene
 
 

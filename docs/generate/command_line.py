@@ -38,8 +38,8 @@ def one(name: str, command: TyperCommand | TyperGroup, shared: set[str]) -> str:
     rows, joins = [], []
     for parameter in command.params:
         if isinstance(parameter, TyperArgument):
-            name = (parameter.metavar or parameter.name or "").strip("[].").upper()
-            rows.append((f"`{name}`", shown(parameter), plain(parameter.help or "")))
+            argument = (parameter.metavar or parameter.name or "").strip("[].").upper()
+            rows.append((f"`{argument}`", shown(parameter), plain(parameter.help or "")))
         elif isinstance(parameter, TyperOption) and not parameter.hidden and "--help" not in parameter.opts:
             if parameter.help in shared:
                 joins.append(f"`{parameter.opts[0]}`")

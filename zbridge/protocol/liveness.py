@@ -1,9 +1,9 @@
 """How each side of a session knows that the other one lives: what we repeat, and how long nothing came. Sans-IO.
 
-Theory of operation. A watch begins when a session is established. Every message that could be read is a sign of life;
-noise is none. After ``silent_s`` without one the robot is not driven, after ``lost_s`` the session ends. A conversation
-reads what waits before it runs timers that are late, so a process that was paused does not take its own pause for the
-robot's.
+Theory of operation. A watch begins when a session is established, at the next timer. Every message that could be read
+is a sign of life; noise is none. After ``silent_s`` without one the robot is not driven, after ``lost_s`` the session
+ends. A conversation reads what waits before it runs timers that are late, so a process that was paused does not take
+its own pause for the robot's.
 """
 
 from __future__ import annotations
@@ -47,13 +47,19 @@ class SilenceWatch(Kept):
         """When :meth:`judge` will find something new; ``inf``: never."""
         return self._heard_at + (self.lost_s if self._silent else min(self.silent_s, self.lost_s))
 
+    def begin(self) -> None:
+        """Begin to watch, from the next :meth:`judge` or sign of life on."""
+        self._heard_at = -math.inf if self.on else math.inf
+
     def heard(self, now: float, busy: str | None) -> str | None:
-        """Note a sign of life; the first one begins the watch. Return ``busy``, None if this watch had set it."""
+        """Note a sign of life. Return ``busy``, None if this watch had set it."""
         self._heard_at, silent, self._silent = now, self._silent, False
         return None if silent and busy == _nothing_for(self.silent_s) else busy
 
     def judge(self, now: float, busy: str | None) -> tuple[str | None, str | None]:
         """Return why the peer is busy now (``busy`` if it was so already), and why the session must end, or None."""
+        if self._heard_at == -math.inf:
+            self._heard_at = now
         self._silent = self._silent or now >= self._heard_at + self.silent_s
         lost = _nothing_for(self.lost_s) if now >= self._heard_at + self.lost_s else None
         return busy or (_nothing_for(self.silent_s) if self._silent else None), lost

@@ -22,6 +22,11 @@ class RateLimit(Kept):
     def __repr__(self) -> str:
         return f"<RateLimit {self.left:g} of {self.rate_hz:g} a second>"
 
+    @property
+    def exceeded(self) -> str:
+        """Why a peer that sends more must go."""
+        return f"flood: more than {self.rate_hz:g} messages a second"
+
     def fill(self, now: float) -> float:
         """Add the tokens of the time since the last call; give those there are."""
         if self.left < self.burst:

@@ -76,7 +76,6 @@ class Session(Kept, ABC, Generic[M]):
         "outbox": Outbox,
         "_limit_at": float,
         "_allowance": RateLimit,
-        "silence": SilenceWatch,
     }
     role: Role
     frame_end: FrameEnd
@@ -112,8 +111,7 @@ class Session(Kept, ABC, Generic[M]):
         self._limit_at = math.inf
         self._allowance = RateLimit(limits.rate_hz)
         self.silence = SilenceWatch(self.silent_s, self.lost_s)
-        self._now = -math.inf
-        """The time of the last call that may establish the session."""
+        self._watches = self.silence.on
 
     def __repr__(self) -> str:
         reason = f" ({self.reason})" if self.reason else ""
@@ -165,22 +163,26 @@ class Session(Kept, ABC, Generic[M]):
             return messages
         traffic, decode, tap, handled = self.traffic, self.decode, self.tap, self.handled
         traffic.bytes_in += len(data)
-        malformed, self._now = traffic.malformed, now
-        frames, allowed = 0, self._allowance.fill(now) if self._allowance.rate_hz < math.inf else math.inf
+        frames = broken = 0
+        allowed = self._allowance.fill(now) if self._allowance.rate_hz < math.inf else math.inf
         try:
             for frame in self._frames.feed(data):
                 frames += 1
                 if frames > allowed:
-                    self._flooded()
+                    self.fail(self._allowance.exceeded)
                     break
                 if tap is not None:
                     tap("in", frame)
                 try:
                     message = decode(frame)
-                    if (established and type(message) not in handled) or self.accept(message, now):
+                    if established and type(message) not in handled:  # nearly always
+                        messages.append(message)
+                        continue
+                    if self.accept(message, now):
                         messages.append(message)
                 except ProtocolError as error:
                     self.malformed(str(error))
+                    broken += 1
                 except (EncodeError, Refused) as error:
                     self.fail(f"no answer possible: {error}")
                 if self.over:
@@ -191,7 +193,7 @@ class Session(Kept, ABC, Generic[M]):
             self.fail(f"broken stream: {error}")
         traffic.frames_in += frames
         self._allowance.left -= frames
-        if self.silence.on and frames > traffic.malformed - malformed:
+        if self._watches and frames > broken:
             self._heard(now)
         return messages
 
@@ -200,7 +202,7 @@ class Session(Kept, ABC, Generic[M]):
         if self.over:
             return []
         if not self._allowance.take(now):
-            self._flooded()
+            self.fail(self._allowance.exceeded)
             return []
         self.traffic.frames_in += 1
         self.traffic.bytes_in += len(datagram)
@@ -226,11 +228,8 @@ class Session(Kept, ABC, Generic[M]):
 
     def _heard(self, now: float) -> None:
         """Note a sign of life of an established peer."""
-        if self.silence.on and self.state is _ESTABLISHED:
+        if self._watches and self.state is _ESTABLISHED:
             self.busy = self.silence.heard(now, self.busy)
-
-    def _flooded(self) -> None:
-        self.fail(f"flood: more than {self.limits.rate_hz:g} messages a second")
 
     def malformed(self, what: str) -> None:
         """Count a malformed message of the peer; ``what`` describes it."""
@@ -259,16 +258,17 @@ class Session(Kept, ABC, Generic[M]):
         if self.state is _CLOSED:
             return None
         outbox = self.outbox.deadline() if writing else None
-        timers = math.inf if self.state is _CLOSING else min(self.timers(), self.silence.due)
+        timers = math.inf if self.state is _CLOSING else self.timers()
+        if self._watches:
+            timers = min(timers, self.silence.due)
         earliest = min(self._limit_at, timers, math.inf if outbox is None else outbox)
         return None if earliest == math.inf else earliest
 
     def expire(self, now: float) -> None:
         """Run the timers that are due."""
-        self._now = now
         if not self.over and now >= self.timers():
             self.on_timer(now)
-        if not self.over and now >= self.silence.due:
+        if self._watches and not self.over and now >= self.silence.due:
             self.busy, lost = self.silence.judge(now, self.busy)
             if lost is not None:
                 self.fail(lost)
@@ -337,7 +337,7 @@ class Session(Kept, ABC, Generic[M]):
         A deposit has no incomplete frame: it changes with every read, and who watches the reads adds it
         (:meth:`partial`).
         """
-        state = super().export(budget)
+        state = super().export(budget) | ({"silence": self.silence.export()} if self._watches else {})
         return state | {PARTIAL: list(self._frames.partial() or ())} if budget is None else state
 
     def partial(self, most_bytes: int) -> Partial | None:
@@ -350,10 +350,9 @@ class Session(Kept, ABC, Generic[M]):
         To be called in place of :meth:`open`, on a session that was just made from the same settings.
         """
         super().restore(state)
-        try:
-            partial = Partial(*msgspec.convert(state.get(PARTIAL, (b"", 0)), tuple[bytes, int]))
-        except msgspec.ValidationError as error:
-            raise ProtocolError(f"incomplete frame: {error}") from error
+        if self._watches:
+            self.silence.restore(state.get("silence", {}))
+        partial = Partial.read(state.get(PARTIAL, (b"", 0)))
         self._frames.resume(partial)
         if partial.skip:
             self.left_out[SKIPPED] += 1
@@ -368,7 +367,7 @@ class Session(Kept, ABC, Generic[M]):
 
 
 def _begin(session: Session[Any], reason: str, now: float) -> None:
-    session._limit_at, session._now = now + session.limits.handshake_s, now
+    session._limit_at = now + session.limits.handshake_s
     session.opened(now)
 
 
@@ -377,8 +376,8 @@ def _agree(session: Session[Any], reason: str, now: float) -> None:
     keep_alive = session.keep_alive
     if keep_alive is not None:
         frames = (session.encode(keep_alive.message),)
-        session.outbox.set(KEEP_ALIVE, frames, session._now, period_s=keep_alive.period_s)
-    session._heard(session._now)
+        session.outbox.set(KEEP_ALIVE, frames, -math.inf, period_s=keep_alive.period_s)
+    session.silence.begin()
 
 
 def _leave(session: Session[Any], reason: str, now: float) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import msgspec
 
 from zbridge.errors import ProtocolError
 
@@ -29,6 +31,14 @@ class Partial(NamedTuple):
 
     rest: bytes = b""
     skip: int = 0
+
+    @classmethod
+    def read(cls, raw: Any) -> Partial:
+        """Read what another process exported; raise ProtocolError for anything else."""
+        try:
+            return cls(*msgspec.convert(raw, tuple[bytes, int]))
+        except msgspec.ValidationError as error:
+            raise ProtocolError(f"incomplete frame: {error}") from error
 
 
 class FramingFault(ProtocolError):

@@ -51,3 +51,12 @@ def test_factors_add_up() -> None:
 def test_absurd_settings_are_refused(options: dict[str, float]) -> None:
     with pytest.raises(msgspec.ValidationError):
         msgspec.convert(options, Differential)
+
+
+def test_a_robot_that_takes_speed_and_turn_rate_gets_them_in_si_units() -> None:
+    assert CAR.velocity(Drive(forward=-0.5, left=0.1, turn=0.5)) == (
+        -0.5 * CAR.speed_full_m_s,
+        0.5 * CAR.turn_full_rad_s,
+    )
+    with pytest.raises(Unsupported, match="does not move sideways"):
+        CAR.velocity(Drive(left=0.5))

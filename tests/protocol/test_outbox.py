@@ -222,3 +222,21 @@ def test_while_it_is_muted_nothing_but_the_handshake_leaves_or_waits() -> None:
     assert drained(outbox, 5.0, 9.0) == [], "what came meanwhile is forgotten"
     outbox.put(b"after")
     assert drained(outbox, 9.0, 9.0) == [(9.0, b"after")]
+
+
+def test_a_group_that_replaces_another_one_halfway_is_sent_whole_and_at_once() -> None:
+    outbox = Outbox(0.1)
+    play(
+        outbox,
+        "set wheels a1 b1 at 0 every 5; take 0 = a1; set wheels a2 b2 at 0.05 every 5;"
+        " from 0.1 to 6 = 0.1:b2 0.2:a2 5.2:a2 5.3:b2",
+    )
+
+
+def test_groups_that_are_replaced_faster_than_they_are_written_starve_no_frame() -> None:
+    outbox = Outbox(0.1)
+    taken = []
+    for step in range(6):
+        outbox.set("wheels", (b"a%d" % step, b"b%d" % step), step * 0.1)
+        taken.append(outbox.take(step * 0.1))
+    assert taken == [b"a0", b"b1", b"a2", b"b3", b"a4", b"b5"]

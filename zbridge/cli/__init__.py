@@ -1,14 +1,14 @@
 """The command line.
 
 Commands: ``zbridge run, check, init, simulate, probe, demo, router, foxglove, ls, top, doctor, health, echo,
-drive, stop, unlatch, restart, certs, record, info, export, mark, replay, ros2``.
+drive, stop, unlatch, restart, certs, record, info, export, mark, replay, ros2, new-protocol``.
 
 Knows no protocol. Only this package imports typer, and this module does not: ``zbridge run`` loads neither typer nor
-rich. ``app`` declares the commands; ``certs``, ``doctor``, ``robot_commands`` and ``recording_commands`` declare groups
-of them. ``bus``, ``check``, ``demo`` (with ``demo_bus``), ``diagnosis``, ``drive``, ``echo``, ``gateway_commands``,
-``probe``, ``recording``, ``router``, ``supervise``, ``top`` and ``viewers`` implement them; ``terminal`` prints lines
-and tables. ``keyboard`` converts keys to drives; ``fork_server`` forks the gateways of ``zbridge run DIR``. Exit codes:
-``commands.md``.
+rich. ``app`` declares the commands; ``certs``, ``doctor``, ``new_protocol``, ``robot_commands`` and
+``recording_commands`` declare groups of them. ``bus``, ``check``, ``demo`` (with ``demo_bus``), ``diagnosis``,
+``drive``, ``echo``, ``gateway_commands``, ``probe``, ``recording``, ``router``, ``simulate``, ``supervise``, ``top``
+and ``viewers`` implement them; ``terminal`` prints lines and tables. ``keyboard`` converts keys to drives;
+``fork_server`` forks the gateways of ``zbridge run DIR``. Exit codes: ``commands.md``.
 """
 
 from __future__ import annotations

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import logging
-import tomllib
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from zbridge.app import addressed, listener_template, robot_template, secured, until_signal
+from zbridge.app import addressed, listener_template, robot_template, secured
 from zbridge.bus.tls.files import folder_tls
 from zbridge.cli import (
     certs,
@@ -17,21 +16,19 @@ from zbridge.cli import (
     doctor,
     give_up,
     hand_on_tls,
+    new_protocol,
     recording_commands,
     robot_commands,
     run_command,
     run_gateway,
-    run_loop,
     run_together,
     set_up_log,
 )
 from zbridge.cli.options import Connect, FileTls, Json, Realm, TlsFolder, check_name
 from zbridge.client import bus_settings
-from zbridge.errors import ConfigError, LinkError
+from zbridge.errors import LinkError
 from zbridge.host.settings import HostSettings, load_host, robot_files
-from zbridge.protocol.address import Address
-from zbridge.protocol.plugin import HqSimulation, Protocol, Simulation, find_protocol, protocol_names
-from zbridge.tasks import together
+from zbridge.protocol.plugin import find_protocol, protocol_names
 from zbridge.toml import prefixed
 from zbridge.version import __version__
 
@@ -47,6 +44,7 @@ app.add_typer(console.app, name="console")
 app.add_typer(robot_commands.app)
 app.add_typer(doctor.app)
 app.add_typer(recording_commands.app)
+app.add_typer(new_protocol.app)
 
 Files = Annotated[
     list[Path], typer.Argument(help="a gateway's configuration (TOML), several, or a directory", show_default=False)
@@ -67,8 +65,18 @@ SimulatedAt = Annotated[
         "By default where `zbridge init` expects a robot"
     ),
 ]
+OnSerial = Annotated[
+    bool,
+    typer.Option("--serial", help="put the robot on a serial line, a pair of pseudo terminals, and print its address"),
+]
 ServedBy = Annotated[
-    str, typer.Option(help="simulate an HQ program instead, as fragile as a legacy one, and connect it to this address")
+    str,
+    typer.Option(
+        help="simulate an HQ program instead, as fragile as a legacy one, and connect it to this address. A protocol "
+        "that has none: connect its robot side to the robot at this address, tcp://host:port or "
+        "serial:///path?baud=N, and print what it sends. This bypasses the gateway: only for a robot that no gateway "
+        "serves"
+    ),
 ]
 Drives = Annotated[
     str, typer.Option(help="with --hq: drive FORWARD or FORWARD,TURN, fractions of full scale: 0.3 or 0.3,-0.2")
@@ -183,6 +191,7 @@ def init(
 def simulate(
     protocol: ProtocolName,
     listen: SimulatedAt = [],
+    serial: OnSerial = False,
     hq: ServedBy = "",
     drive: Drives = "",
     seed: Annotated[int, typer.Option(help="seed of the simulated world")] = 1,
@@ -194,77 +203,23 @@ def simulate(
     verbose: Verbose = False,
 ) -> None:
     """Simulate a robot, or an HQ program, until SIGTERM or SIGINT."""
+    from zbridge.cli.simulate import SimulateOptions
+    from zbridge.cli.simulate import simulate as begin
+
     set_up_log(verbose=verbose)
-    simulated = find_protocol(protocol)
-    if listen and hq:
-        give_up(2, "give either --listen (a robot) or --hq (an HQ program)")
-    if camera and hq:
-        give_up(2, "--camera: not with --hq")
-    if drive and not hq:
-        give_up(2, "--drive: only with --hq")
-    if hq:
-        with prefixed("--hq ", LinkError):
-            address = Address.parse(hq)
-        program = HqSimulation(address, version or None, dialect or None, udp, read_drive(drive))
-        simulate_hq(simulated, program)
-        return
-    with prefixed("--listen ", LinkError):
-        addresses = tuple(map(Address.parse, listen or default_addresses(simulated)))
-    simulation = Simulation(
-        addresses,
-        seed,
-        version or None,
-        dialect or None,
-        udp,
-        fragile,
-        lambda addresses: print(f"listening on {' '.join(map(str, addresses))}", flush=True),  # noqa: T201
+    options = SimulateOptions(
+        listen=tuple(listen),
+        serial=serial,
+        hq=hq,
+        drive=drive,
+        seed=seed,
+        version=version or None,
+        dialect=dialect or None,
+        udp=udp,
+        fragile=fragile,
+        camera=camera,
     )
-    run_loop(until_signal(simulate_robot(simulated, simulation, camera)))
-
-
-def default_addresses(protocol: Protocol) -> list[str]:
-    """Return where the protocol's template expects a robot; raise ConfigError if it names no address of that kind."""
-    device = tomllib.loads(protocol.template).get("device", {})
-    addresses = [text for text in device.get("connect", []) if text.startswith("tcp://")]
-    if not addresses:
-        raise ConfigError(f"listen: missing, the template of {protocol.name} names no address tcp://host:port")
-    return addresses
-
-
-def read_drive(text: str) -> tuple[float, float] | None:
-    """Read ``FORWARD`` or ``FORWARD,TURN``; None for an empty text. Raises ConfigError."""
-    if not text:
-        return None
-    try:
-        forward, turn = (*map(float, text.split(",")), 0.0)[:2]
-        if text.count(",") < 2 and abs(forward) <= 1.0 and abs(turn) <= 1.0:
-            return forward, turn
-    except ValueError:
-        pass
-    raise ConfigError(f"drive = {text!r}: expected FORWARD or FORWARD,TURN, each -1 to 1")
-
-
-async def simulate_robot(simulated: Protocol, simulation: Simulation, camera: str) -> None:
-    """Simulate a robot, and its camera if an address is given, until cancelled."""
-    if not camera:
-        await simulated.simulate(simulation)
-        return
-    from zbridge.simulation.camera import serve_camera
-
-    with prefixed("--camera ", LinkError):
-        address = Address.parse(f"tcp://{camera}")
-    work = serve_camera(address, lambda url: print(f"camera at {url}", flush=True))  # noqa: T201
-    await together(simulated.simulate(simulation), work)
-
-
-def simulate_hq(simulated: Protocol, simulation: HqSimulation) -> None:
-    """Simulate an HQ program until SIGTERM or SIGINT, or until it dies or its connection ends."""
-    if simulated.simulate_hq is None:
-        give_up(2, f"there is no simulated HQ program of {simulated.name}")
-    try:
-        run_loop(until_signal(simulated.simulate_hq(simulation)))
-    except OSError as error:
-        give_up(1, f"{simulation.address}: {error.strerror or error}")
+    begin(find_protocol(protocol), options)
 
 
 @app.command()

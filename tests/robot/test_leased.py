@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 
 import pytest
 
@@ -23,7 +24,8 @@ ON, OFF = bytes.fromhex("06000000 02 32 01000000"), bytes.fromhex("06000000 02 3
 def _motors(monkeypatch: pytest.MonkeyPatch) -> None:
     def leased(self: TcpUdpRobot, on: bool, now: float) -> None:
         assert self.driving is not None
-        self.driving.send(packets.ClientLidarMode(1 if on else 2))
+        frame = self.driving.encode(packets.ClientLidarMode(1 if on else 2))
+        self.driving.outbox.set("motors", (frame,), -math.inf)
 
     monkeypatch.setattr(TcpUdpRobot, "leased", leased)
 
@@ -100,3 +102,57 @@ async def test_a_protocol_that_raises_changes_nothing_of_the_lease(
         assert ("leased", "full") in [(command, reason) for _, command, reason, _ in await rig.refused()]
     else:
         assert "r1: leased: a fault of the protocol: ValueError: broken in leased" in caplog.text
+
+
+@pytest.mark.parametrize("stalled", [True, False], ids=["stalled", "gap between writes"])
+async def test_motors_are_on_for_a_lease_that_follows_another_one_at_once(rig: Rig, stalled: bool) -> None:
+    rig.hold()
+    await asyncio.sleep(0.5)
+    rig.command("drive", {"left": 1.0})
+    await asyncio.sleep(0.2)
+    switches(rig)
+    if stalled:
+        rig.link.unacknowledged_s = 1.0
+        rig.conversations[-1].pump()
+    rig.driver.release()
+    assert rig.hold()["ok"]
+    rig.link.unacknowledged_s = 0.0
+    await asyncio.sleep(2.0)
+    assert [each for each in switches(rig) if each != STOP][-1] == ON
+
+
+async def test_a_gateway_that_steps_aside_switches_off_first_and_one_that_steps_in_does_too(rig: Rig) -> None:
+    """Another gateway may have died meanwhile, while its program had the lease."""
+    rig.hold()
+    await asyncio.sleep(0.5)
+    rig.command("drive", {"left": 1.0})
+    await asyncio.sleep(0.2)
+    switches(rig)
+    await rig.device.step_aside()
+    await asyncio.sleep(2.0)
+    assert switches(rig) == [STOP, OFF]
+    await rig.device.step_in()
+    await asyncio.sleep(2.0)
+    assert OFF in switches(rig)
+
+
+async def test_a_gateway_that_ends_switches_off_though_the_robot_stands() -> None:
+    async with established(hold=True) as rig:
+        await asyncio.sleep(0.5)
+        written = rig.link.written
+    assert [frame for frame in written if frame in (ON, OFF)] == [ON, OFF]
+
+
+async def test_what_the_robot_side_refuses_is_told_again_every_second(rig: Rig, monkeypatch) -> None:
+    answers = [NotReady("full"), NotReady("full"), None]
+    told = []
+
+    def leased(self: TcpUdpRobot, on: bool, now: float) -> None:
+        told.append(on)
+        if (error := answers.pop(0)) is not None:
+            raise error
+
+    monkeypatch.setattr(TcpUdpRobot, "leased", leased)
+    rig.hold()
+    await asyncio.sleep(5.0)
+    assert told == [True] * 3

@@ -26,7 +26,7 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, Motion, Pose, Scan
 from zbridge.protocol import KEEP_ALIVE, Codec, KeepAlive, Odometry, Outcome, Protocol, Simulation, Truth
 from zbridge.simulation import serve
-from zbridge.simulation.checks import bearings, journeys, motion
+from zbridge.simulation.checks import bearings, handover, journeys, motion
 from zbridge.simulation.checks.commands import check_commands
 from zbridge.simulation.checks.examples import check_examples
 from zbridge.simulation.checks.finding import CheckFinding
@@ -167,6 +167,23 @@ def never_restarted(self: Any, link: str, peer: str) -> Any:
     return session
 
 
+class BusyLater(Robot):
+    """Its second session, and those after it, are busy once established."""
+
+    def session(self, link: str, peer: str) -> Any:
+        later = self.driving is not None
+        session = super().session(link, peer)
+        establish = session.establish
+
+        def busily(version: str, features: tuple[str, ...]) -> None:
+            establish(version, features)
+            session.busy = "the bumper is pressed"
+
+        if later:
+            session.establish = busily
+        return session
+
+
 class Unwrapped(Robot):
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
@@ -292,6 +309,24 @@ LIVE: dict[str, tuple[Callable[..., list[CheckFinding]], Protocol, str, str]] = 
         with_robot(session=never_restarted),
         journeys.CONNECTED_AGAIN,
         "its pose changed by",
+    ),
+    "a pose that is lost in a restart of the gateway": (
+        drive,
+        with_robot(restore=lambda self, state: None),
+        handover.CLAIM,
+        "pose.x shows",
+    ),
+    "a keep-alive that is lost in a restart of the gateway": (
+        drive,
+        with_session(restore=lambda self, state: (Session.restore(self, state), self.outbox.clear(KEEP_ALIVE))),
+        handover.CLAIM,
+        "is written, not Command(number=0)",
+    ),
+    "a session that stays busy": (
+        again,
+        broken(robot=BusyLater),
+        journeys.CONNECTED_AGAIN,
+        "then a drive is refused: not_ready: ArcosSession takes no commands: the bumper is pressed",
     ),
     "a pose that jumps at a wrap": (wrap, broken(robot=Unwrapped), journeys.WRAPS, "the pose shows -6"),
     "a bearing that is mirrored": (

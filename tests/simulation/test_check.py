@@ -179,7 +179,7 @@ ESTABLISHED = "the session with the simulated robot is established"
     [
         (
             lambda self, now: None,
-            "link robot (BrokenSession): still handshaking after 0.3 s; expected Session.establish",
+            "link robot (BrokenSession): still handshaking after 0.3 s; last written: nothing; last received: b'at 0.0",
         ),
         (lambda self, now: self.fail("I do not like it"), "link robot (BrokenSession): ended: I do not like it"),
         (lambda self, now: {}[1], "ended: a fault of the protocol: KeyError: 1 in <lambda> (test_check.py:"),
@@ -203,6 +203,7 @@ def test_what_ends_a_session_names_class_field_and_expectation_and_no_time_that_
     (problem,) = failed(check_sessions(protocol, asyncio.run(record(protocol, 10.0)))).values()
     assert re.sub(r":\d+", "", problem) == (
         "link robot (BrokenSession): ended: a fault of the protocol: KeyError: 'x' in Hasty.opened (test_check.py); "
+        "last written: nothing; last received: nothing; "
         "expected ProtocolError for what a robot must not say, and no other exception"
     )
 
@@ -213,7 +214,7 @@ def test_a_robot_with_other_links_than_its_protocol_is_found() -> None:
 
 
 GARBAGE, SILENCE, END = "garbage at", "silence at", "the end of the connection at"
-SILENT, ALIVE = "a robot that falls silent is not driven", "the keep-alive is written in time"
+SILENT = "a robot that falls silent is not driven"
 TRANSLATED = "messages of the robot are translated"
 
 
@@ -239,7 +240,7 @@ TRANSLATED = "messages of the robot are translated"
         ),
         (
             with_robot(pose=lambda self, message, stamp_ns: {}[message.x]),
-            {TRANSLATED: "KeyError", GARBAGE: "KeyError", SILENT: "KeyError", ALIVE: "KeyError"},
+            {TRANSLATED: "KeyError", GARBAGE: "KeyError", SILENT: "KeyError"},
         ),
         (with_robot(pose=lambda *_: ((topics.POSE, Switch(on=True)),)), {TRANSLATED: "PayloadError"}),
         (
@@ -389,7 +390,7 @@ def test_the_whole_check_passes_for_a_sound_protocol(monkeypatch, capsys) -> Non
     monkeypatch.setattr(kit, "find_protocol", lambda name: TOY)
     assert kit.main(["toy"]) == 0
     out = capsys.readouterr().out
-    assert out.endswith("hold, 0 do not, 8 not checked\n")
+    assert out.endswith("hold, 0 do not, 9 not checked\n")
     assert "ok    the simulated robot drives" in out
 
 

@@ -6,7 +6,7 @@ import random
 import zlib
 
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from zbridge.errors import EncodeError, ProtocolError
@@ -86,6 +86,7 @@ def test_only_the_damaged_packet_is_lost(sent: list[bytes], seed: int, damage: s
         "lengthened": damaged[:place] + b"\xfa\xfb\xff" + damaged[place:],
         "left out": b"",
     }[damage]
+    assume(PACKETS.packet(sent[hit]) not in damaged + noise)  # else the noise has mended it
     tail = [b"the tail"] * 8  # as many bytes as a wrong count can claim
     frames = [PACKETS.packet(body) for body in (*sent[:hit], *sent[hit + 1 :], *tail)]
     stream = b"".join((*frames[:hit], damaged, noise, *frames[hit:]))

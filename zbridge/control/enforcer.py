@@ -218,6 +218,7 @@ class Enforcer:
                 self.authority.refuse(command, refusal, count=count)
                 self._refused.value += count - 1  # settling counts one
         self._same_stops.value = self.admission.same_stops
+        self.lease_hook.repeat()
         self.settle()
         self._save_latches()
         self.report()

@@ -110,6 +110,11 @@ class Outbox(Kept):
         """Whether frames of a stop, or of a handshake, still wait."""
         return bool(self._urgent or self._exempt)
 
+    def waits(self, now: float) -> bool:
+        """Return whether a frame waits for its turn, or for the gap; repetitions that are not due yet do not wait."""
+        deadline = self.deadline()
+        return deadline is not None and deadline <= now + self.gap_s
+
     def put(self, frame: bytes) -> None:
         """Queue a frame that is sent once; raise Refused when ``limit`` frames wait."""
         if self._muted:

@@ -130,7 +130,8 @@ class RobotSide(Kept, ABC):
 
         Called when a program takes the lease, when nobody has it any more (the stop goes first), and after each
         connection is established, with what holds then. A lease that passes from one program to another changes
-        nothing.
+        nothing. Use a slot of its own, due at ``-inf``: it leaves behind stops and before motion, and an "on" that
+        follows replaces an "off" that still waits.
         """
         return
 

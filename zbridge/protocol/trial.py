@@ -90,7 +90,8 @@ class Example(msgspec.Struct, frozen=True):
     Without examples, a fault that session and simulated robot share cannot be found. codec: the name of the
     :class:`Codec`. message: what the frame is read as, and what is written as this frame. shown: the numbers that the
     bus must show of it, by path and field (``{"battery.voltage": 12.5, "sensor/front.value": 0.3}``), in the bus's
-    units. command: a drive for which the robot must be sent this frame. source: where the bytes stand.
+    units. before: frames that came before this one, as counters need. command: a drive for which the robot must be sent
+    this frame. source: where the bytes stand.
     """
 
     codec: str
@@ -99,3 +100,4 @@ class Example(msgspec.Struct, frozen=True):
     shown: dict[str, float] = {}
     command: Drive | None = None
     source: str = ""
+    before: tuple[bytes, ...] = ()

@@ -153,6 +153,9 @@ class Connection:
             reason, established = await self._converse()
             if established:
                 backoff.reset()
+            if self._ending:
+                log.info("%s: %s", self._label, reason)
+                return
             delay_s = backoff.delay_s()
             log.info("%s: %s; next attempt in %.1f s", self._label, reason, delay_s)
             self._set_state("offline", reason)

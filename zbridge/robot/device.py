@@ -249,6 +249,7 @@ class RobotDevice(Transferable):
         await self.withdraw()
         self._publishers.mute(True)
         await self._stop_written()
+        self.enforcer.lease_hook.forget()
         for connection in self._links:
             connection.mute(True)
         on_demand, self._on_demand = self._on_demand, []
@@ -272,9 +273,7 @@ class RobotDevice(Transferable):
 
     async def _stop_written(self) -> None:
         session, until = self._context.robot.driving, self._context.clock() + ASIDE_S
-        while session is not None and session.outbox.hurried:
-            if self._context.clock() >= until:
-                return
+        while session and session.outbox.waits(now := self._context.clock()) and now < until:  # noqa: ASYNC110 - bounded
             await asyncio.sleep(_LOOK_S)
 
     # A restart: another process takes the robot over
@@ -385,6 +384,7 @@ class RobotDevice(Transferable):
         self._refuse_all(_LEAVING)
         if self.enforcer.authority.motion.moving:
             self.enforcer.stop(_LEAVING)
+        self.enforcer.lease_hook.leave()
         await asyncio.sleep(min(self._standstill.stopping_s, STOP_REPEAT_S))
         await asyncio.gather(*(connection.close(_LEAVING, LEAVE_S) for connection in self._links))
         self._presence.publish_status()

@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from zbridge.errors import ProtocolError, Refused
+from zbridge.errors import NeutralFirst, NotReady, ProtocolError, Refused
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage
 from zbridge.fleet.topics import Topic
@@ -25,7 +25,9 @@ _NS_PER_S = 1_000_000_000
 class Scene:
     """A protocol's robot side, as a gateway has it, connected to a simulated robot. Time passes in :meth:`run` only.
 
-    options: ``[device.options]``; None: those that fit the simulated robot.
+    As in a gateway, a robot that is not ready takes no command, one that becomes busy is stopped, and motion then needs
+    neutral first. There is no lease, deadman or latch. options: ``[device.options]``; None: those that fit the
+    simulated robot.
     """
 
     def __init__(self, protocol: Protocol, simulated: SimulatedRobot, options: dict[str, Any] | None = None) -> None:
@@ -41,6 +43,8 @@ class Scene:
         """The newest telemetry, by the paths of its topics: ``pose``, ``sensor/front``."""
         self.written: list[bytes] = []
         """What the gateway's side wrote, frame by frame."""
+        self._busy: str | None = None
+        self._needs_neutral = False
         self.answers = True
         """False: what the robot sends is lost, as by a cable that is cut in one direction."""
         self.connect()
@@ -53,7 +57,7 @@ class Scene:
         if self.robot.driving is not None:
             self.robot.driving.fail("closed by peer")
         self.session = self.robot.session(self.robot.link_names[0], PEER)
-        self._greeted = False
+        self._greeted, self._busy = False, None
         self.session.open(self.now)
         self._hear(self.simulated.connected())
 
@@ -85,6 +89,7 @@ class Scene:
             self.now += STEP_S
             self._hear(self.simulated.step(STEP_S))
             self.session.expire(self.now)
+            self._follow_busy()
             while (frame := self.session.outgoing(self.now)) is not None:
                 self.session.outbox.written(self.now)
                 self.written.append(frame)
@@ -95,12 +100,26 @@ class Scene:
         return self.command(topics.CMD_DRIVE, Drive(forward=forward, left=left, turn=turn))
 
     def command(self, topic: Topic, command: FleetMessage) -> Outcome:
-        """Command the robot as the gateway does; raise Refused where the robot is not ready, or refuses."""
-        return self.robot.command(topic, command, self.now)
+        """Command the robot as the gateway does; raise Refused where it is not ready, needs neutral, or refuses."""
+        if not self.robot.ready:
+            raise NotReady(self.session.busy or self.session.reason or "offline")
+        moving = isinstance(command, Drive) and command.moving
+        if moving and self._needs_neutral:
+            raise NeutralFirst("the robot was stopped: neutral must come before motion")
+        outcome = self.robot.command(topic, command, self.now)
+        self._needs_neutral = self._needs_neutral and not isinstance(command, Drive)
+        return outcome
 
     def stop(self, repeated_s: float = STOPPED_S) -> None:
         """Stop the robot, as the gateway does."""
         self.robot.stop(self.now, self.now + repeated_s)
+
+    def _follow_busy(self) -> None:
+        """Stop a robot that has become busy, or is no longer."""
+        if self.session.busy != self._busy and not self.session.over:
+            self._busy, self._needs_neutral = self.session.busy, True
+            with contextlib.suppress(Refused):
+                self.stop()
 
     def _hear(self, data: bytes) -> None:
         if not self.answers or not data:
@@ -109,6 +128,7 @@ class Scene:
             with contextlib.suppress(ProtocolError):
                 stamp_ns = round(self.now * _NS_PER_S)
                 self.shown |= {topic.path: shown for topic, shown in self.robot.telemetry(message, stamp_ns)}
+        self._follow_busy()
         if self.session.state is State.ESTABLISHED and not self._greeted:
             self._greeted = True
             with contextlib.suppress(Refused):

@@ -54,6 +54,7 @@ class Body:
         self.heading = heading
         self.radius = radius
         self.blocked = False
+        """Whether it touches a wall or a box: bumpers are pressed."""
 
     @classmethod
     def placed(cls, place: tuple[float, float, float] | None, *, radius: float = 0.2) -> Body:

@@ -2,7 +2,8 @@
 
 Sans-IO. Knows no protocol: a protocol declares its messages in its own package. ``fields`` has the wire types of
 declarations, ``binary`` and ``text`` the codecs, ``lines`` and ``packets`` whole framings of lines of text and of
-packets with a head, a count and a checksum, ``frames`` the bounded buffer of an incomplete frame.
+packets with a head, a count and a checksum, ``opcodes`` messages that begin with a byte that names them, ``frames`` the
+bounded buffer of an incomplete frame.
 """
 
 from zbridge.wire.binary import BinaryCodec
@@ -30,6 +31,7 @@ from zbridge.wire.fields import (
 )
 from zbridge.wire.frames import FrameBuffer
 from zbridge.wire.lines import Line, Lines
+from zbridge.wire.opcodes import Coded, Opcodes
 from zbridge.wire.packets import Packets
 from zbridge.wire.text import TextCodec
 
@@ -45,6 +47,7 @@ __all__ = [
     "BinaryCodec",
     "Blob",
     "Bool",
+    "Coded",
     "Counted",
     "Decimal",
     "F32Array",
@@ -54,6 +57,7 @@ __all__ = [
     "Line",
     "Lines",
     "Message",
+    "Opcodes",
     "Packets",
     "Rest",
     "Scalar",

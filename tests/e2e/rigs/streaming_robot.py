@@ -7,12 +7,13 @@ killed.
 from __future__ import annotations
 
 import asyncio
+import itertools
 import sys
 import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[3] / "docs" / "examples" / "arcos"))
 
@@ -21,6 +22,7 @@ from arcos.simulator import Arcos
 
 import zbridge
 from tests.ports import HOST, free_port
+from zbridge.errors import NeutralFirst
 from zbridge.protocol import ProtocolError, Simulation
 from zbridge.protocol.address import Address
 from zbridge.simulation import serve
@@ -57,8 +59,6 @@ class Packet:
 class StreamingRobot(Arcos):
     """A simulated robot on a TCP port, on a thread of its own; it obeys although it is mute."""
 
-    WATCHDOG: ClassVar[str] = "the robot's own watchdog has stopped it"
-
     def __init__(self) -> None:
         super().__init__()
         self.port = free_port()
@@ -67,8 +67,7 @@ class StreamingRobot(Arcos):
         """Connections so far."""
         self.mute = False
         """Whether what it sends is lost; the connection stays."""
-        self.watchdogs = 0
-        """Steps in which its watchdog kept it stopped although nobody had told it to stop."""
+        self._reported_at = 0.0
         self._loop = asyncio.new_event_loop()
         self._serving: asyncio.Task[None]
         listening = threading.Event()
@@ -102,7 +101,8 @@ class StreamingRobot(Arcos):
 
     def step(self, dt: float) -> bytes:
         sent = super().step(dt)
-        self.watchdogs += self.truth().watchdog
+        if sent:
+            self._reported_at = time.monotonic()
         return b"" if self.mute else sent
 
     def _answer(self, packet: bytes) -> bytes:
@@ -119,6 +119,14 @@ class StreamingRobot(Arcos):
     def moving(self) -> bool:
         return any(self.truth().wheels_m_s)
 
+    @property
+    def between_reports(self) -> bool:
+        """Whether what it sent last is read by now, and the next is not sent yet.
+
+        Nobody can take over the connection of a process that dies within a read.
+        """
+        return 0.03 < time.monotonic() - self._reported_at < 0.06 or self.mute
+
     def since(self, at: float) -> list[Packet]:
         """Give what it was sent since then."""
         return [packet for packet in self.packets if packet.at >= at]
@@ -133,14 +141,17 @@ class StreamingRobot(Arcos):
     def longest_pause_s(self, number: int, since: float) -> float:
         """Give the longest time without this command, up to now."""
         times = [since, *(packet.at for packet in self.since(since) if packet.number == number), time.monotonic()]
-        return max(later - earlier for earlier, later in zip(times, times[1:], strict=False))
+        return max(later - earlier for earlier, later in itertools.pairwise(times))
 
 
 def main() -> None:
     with zbridge.blocking.connect([sys.argv[1]]) as fleet, fleet["r1"].control("driver") as drive:
         print("drives", flush=True)
         while True:
-            drive(forward=FORWARD)
+            try:
+                drive(forward=FORWARD)
+            except NeutralFirst:  # a busy machine paused it, or its gateway
+                drive.neutral()
             time.sleep(0.05)
 
 

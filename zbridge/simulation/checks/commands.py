@@ -16,7 +16,7 @@ from zbridge.fleet.messages import Drive, FleetMessage, Mode, Motor, Raw, Scan, 
 from zbridge.fleet.topics import Topic
 from zbridge.protocol.plugin import Protocol
 from zbridge.simulation.checks.examples import check_example_commands
-from zbridge.simulation.checks.finding import CheckFinding, raised
+from zbridge.simulation.checks.finding import CheckFinding, brief, raised
 from zbridge.simulation.checks.rehearsal import STEP_S, Rehearsal, Transcript
 
 WATCHED_S = 0.4
@@ -58,7 +58,7 @@ def _corners(protocol: Protocol, recording: Transcript) -> CheckFinding:
                 rehearsal.robot.command(topics.CMD_DRIVE, drive, rehearsal.now)
             rehearsal.run(STEP_S)
         except Exception as error:
-            problems.append(f"{drive}: {raised(error, 'an Outcome, or Refused')}")
+            problems.append(f"{brief(drive)}: {raised(error, 'an Outcome, or Refused')}")
     return CheckFinding.of(claim, problems, guide=GUIDE)
 
 
@@ -75,9 +75,8 @@ def _dropped(protocol: Protocol, recording: Transcript) -> list[str]:
         if same and not reported:
             found = results[0][1]
             said = found.left_out if found is not None else None
-            problems.append(
-                f"{drives[0]} writes what {base} writes, and left_out is {said!r}; expected one that names {part}"
-            )
+            same_as = f"{brief(drives[0])} writes what {brief(base)} writes"
+            problems.append(f"{same_as}, and left_out is {said!r}; expected one that names {part}")
     return problems
 
 

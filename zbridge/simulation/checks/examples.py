@@ -11,7 +11,7 @@ from zbridge.errors import ProtocolError
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import Topic
 from zbridge.protocol.plugin import Codec, Example, Protocol
-from zbridge.simulation.checks.finding import CheckFinding
+from zbridge.simulation.checks.finding import CheckFinding, brief
 from zbridge.simulation.checks.rehearsal import PEER, Rehearsal, Transcript, robot_of
 
 GUIDE = "8. The protocol: Examples"
@@ -45,7 +45,9 @@ def check_example_commands(protocol: Protocol, recording: Transcript) -> Iterato
     """Check that each command of an example makes the robot side write the example's frame."""
     for number, example in enumerate(protocol.examples, 1):
         if example.command is not None:
-            claim = f"example {number}, {example.source or 'without a source'}: {example.command} writes this frame"
+            claim = (
+                f"example {number}, {example.source or 'without a source'}: {brief(example.command)} writes this frame"
+            )
             yield CheckFinding.tried(claim, partial(_commanded, protocol, recording, example), "a drive", GUIDE)
 
 
@@ -70,6 +72,9 @@ def _compare_shown(protocol: Protocol, message: Any, example: Example) -> list[s
     robot = robot_of(protocol)
     for name in robot.link_names:
         robot.session(name, PEER)
+    codec = next(codec for codec in protocol.codecs if codec.name == example.codec)
+    for earlier in example.before:
+        list(robot.telemetry(codec.read(earlier), _STAMP_NS))
     shown = dict(numbers(robot.telemetry(message, _STAMP_NS)))
     problems = []
     for name, expected in example.shown.items():
@@ -88,7 +93,7 @@ def _commanded(protocol: Protocol, recording: Transcript, example: Example) -> s
     rehearsal.run(_SETTLED_S)
     written, outcome = rehearsal.drive(example.command, _SETTLED_S)
     if outcome is None:
-        return f"{example.command} is refused"
+        return f"{brief(example.command)} is refused"
     return (
         None if example.frame in written else f"{sorted(set(written))} is written, expected {example.frame!r} among it"
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import msgspec
 
@@ -66,6 +67,13 @@ class CheckFinding(msgspec.Struct, frozen=True):
             return f"ok    {self.claim}{note}"
         guide = f"\n      see {self.guide!r} in {GUIDE}" if self.guide else ""
         return f"FAIL  {self.claim}{note}\n      {self.problem}{guide}"
+
+
+def brief(message: Any) -> str:
+    """Show a message without the fields that have their defaults: ``Drive(forward=0.5)``."""
+    fields = {field.name: field.default for field in msgspec.structs.fields(message)}
+    given = {name: getattr(message, name) for name, default in fields.items() if getattr(message, name) != default}
+    return f"{type(message).__name__}({', '.join(f'{name}={value!r}' for name, value in given.items())})"
 
 
 def raised(error: BaseException, expected: str = "") -> str:

@@ -21,6 +21,7 @@ DRIVE_S = 0.8
 WRAP_S = 2.0
 JUMP_M, JUMP_RAD = 0.03, 0.1
 LONG = "a session lasts, and drives the robot, for longer than every period it declares"
+OFF_AND_ON = "its pose does not jump when it was switched off and on"
 CONNECTED_AGAIN, WRAPS = (
     "its pose does not jump when it is connected again",
     "its pose does not jump when a counter wraps",
@@ -84,12 +85,26 @@ async def _by_setpoint(stage: Stage, seconds: float) -> list[str]:
 
 
 async def check_reconnect(protocol: Protocol, stage: Stage, establish_s: float) -> list[CheckFinding]:
-    """Drive away from where it began, lose the connection, and connect again."""
+    """Drive away from where it began; lose the connection and connect again; switch the robot off and on."""
     stage.prepare()
     for forward, turn in ((FORWARD, 0.0), (0.0, TURN), (FORWARD, 0.0)):
         await leg(stage, DRIVE_S, STAND_S, forward=forward, turn=turn)
     if not stage.poses:
-        return [CheckFinding.not_checked(CONNECTED_AGAIN, "it shows no pose", _ODOMETRY)]
+        return [
+            CheckFinding.not_checked(claim, "it shows no pose", _ODOMETRY) for claim in (CONNECTED_AGAIN, OFF_AND_ON)
+        ]
+    findings = [await _without_a_jump(stage, CONNECTED_AGAIN, establish_s)]
+    if stage.truth is None:
+        return [*findings, CheckFinding.not_checked(OFF_AND_ON, NO_TRUTH, _ODOMETRY)]
+    truth = stage.truth
+    stage.close()
+    await stage.device.switch_off()
+    stage.device.switch_on((truth.x, truth.y, truth.heading))
+    return [*findings, await _without_a_jump(stage, OFF_AND_ON, establish_s)]
+
+
+async def _without_a_jump(stage: Stage, claim: str, establish_s: float) -> CheckFinding:
+    """Connect again to a robot that stands where it stood; find a pose that changes, or does not go on."""
     before = stage.poses[-1]
     stage.close()
     await asyncio.sleep(HANG_UP_S)
@@ -97,20 +112,22 @@ async def check_reconnect(protocol: Protocol, stage: Stage, establish_s: float) 
     await stage.connect()
     if not await stage.established(establish_s):
         problem = "; ".join(stage.lacking(establish_s))
-        return [CheckFinding(CONNECTED_AGAIN, f"a second session is not established: {problem}", guide=_ODOMETRY)]
+        return CheckFinding(claim, f"a second session is not established: {problem}", guide="3. The session")
     stage.prepare()
     await stage.watch(STAND_S)
     if not stage.poses:
-        return [CheckFinding(CONNECTED_AGAIN, "it shows no pose after it", guide=_ODOMETRY)]
+        return CheckFinding(claim, "it shows no pose after it", guide=_ODOMETRY)
     jump = max((Way.between(before, pose) for pose in stage.poses), key=lambda way: way.far_m + abs(way.turned_rad))
     if jump.far_m > JUMP_M or abs(jump.turned_rad) > JUMP_RAD:
         problem = f"it stood still, and its pose changed by {jump.far_m:.3f} m and {jump.turned_rad:.3f} rad"
-        return [CheckFinding(CONNECTED_AGAIN, problem, guide=_ODOMETRY)]
+        return CheckFinding(claim, problem, guide=_ODOMETRY)
     again = await leg(stage, DRIVE_S, STAND_S, forward=FORWARD)
+    if again.refused:
+        return CheckFinding(claim, f"then a drive is refused: {again.refused}", guide="3. The session")
     if again.shown is not None and (again.shown.ahead_m < JUMP_M or abs(again.shown.aside_m) > again.shown.ahead_m / 2):
         problem = f"then it moved {again.shown.ahead_m:.3f} m along its heading, {again.shown.aside_m:.3f} m beside it"
-        return [CheckFinding(CONNECTED_AGAIN, problem, guide=_ODOMETRY)]
-    return [CheckFinding(CONNECTED_AGAIN)]
+        return CheckFinding(claim, problem, guide=_ODOMETRY)
+    return CheckFinding(claim)
 
 
 async def check_wrap(protocol: Protocol, stage: Stage) -> list[CheckFinding]:

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 
 from zbridge.protocol.plugin import Protocol
 from zbridge.simulation.checks.finding import CheckFinding
+from zbridge.simulation.checks.handover import check_handover
 from zbridge.simulation.checks.stage import Stage
 from zbridge.simulation.checks.truth import NO_TRUTH, SCALE, SHOWN_SCALE, Leg, Way, full_scale, leg, unlike
 
@@ -48,7 +49,8 @@ async def check_motion(protocol: Protocol, stage: Stage) -> list[CheckFinding]:
     curve = await leg(stage, TURN_S, STAND_S, forward=FORWARD, turn=TURN)
     findings.append(await _stands(stage, WHOLE))
     findings += [_turns(turn, curve, protocol), _rate(turn, protocol), _ahead(after)]
-    return [*findings, _shown((ahead, turn, after, curve), protocol)]
+    findings.append(_shown((ahead, turn, after, curve), protocol))
+    return [*findings, check_handover(protocol, stage.received)]
 
 
 def _drives(ahead: Leg, idle: set[bytes], protocol: Protocol) -> CheckFinding:

@@ -17,7 +17,7 @@ from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
 from zbridge.protocol.exchange import ExchangeSession
-from zbridge.protocol.plugin import Outcome, Protocol, RobotSide
+from zbridge.protocol.plugin import Outcome, Protocol, RobotSide, Telemetry
 from zbridge.protocol.session import Session, State
 
 STEP_S = 0.01
@@ -31,14 +31,17 @@ _MOST_WRITES = 10_000
 
 
 class Transcript(msgspec.Struct):
-    """The frames of the driving link, and whether all links were established. ``answers``: what followed a frame."""
+    """The frames of the driving link, and whether all links were established. ``answers``: what followed a frame.
+
+    unanswered: requests without an answer; None: the session sends none.
+    """
 
     received: list[bytes] = []
     answers: dict[bytes, list[bytes]] = {}
     messages: list[Any] = []
     established: bool = False
     reason: str | None = None
-    unanswered: int = 0
+    unanswered: int | None = None
 
 
 def robot_of(protocol: Protocol) -> RobotSide:
@@ -60,8 +63,11 @@ class Rehearsal:
     """The first link of a new robot object, without a link. ``now``: its time, seconds."""
 
     def __init__(self, protocol: Protocol, recording: Transcript) -> None:
+        self._protocol = protocol
         self.robot = robot_of(protocol)
         self.now = 0.0
+        self.shown: list[Telemetry] = []
+        """Telemetry of all that was received."""
         sessions = [self.robot.session(name, PEER) for name in self.robot.link_names]
         self.session: Session[Any] = sessions[0]
         self._recording = recording
@@ -79,11 +85,22 @@ class Rehearsal:
             raise RuntimeError(f"{rehearsal.session!r} after what established it before")
         return rehearsal
 
-    def play(self, frames: list[bytes]) -> None:
-        """Play these frames of the robot, one after the other."""
+    def play(self, frames: list[bytes]) -> list[bytes]:
+        """Play these frames of the robot, one after the other; return what was written."""
+        written = []
         for frame in frames:
-            self.run(STEP_S)
+            written += self.run(STEP_S)
             self._hear(frame)
+        return written
+
+    def hand_over(self) -> None:
+        """Go on with new objects, as another process does with the state of these; raise ProtocolError."""
+        states = msgspec.msgpack.encode((self.session.export(), self.robot.export()))
+        session, robot = msgspec.msgpack.decode(states)
+        self.robot = robot_of(self._protocol)
+        self.session, *_ = (self.robot.session(name, PEER) for name in self.robot.link_names)
+        self.session.restore(session)
+        self.robot.restore(robot)
 
     def establish(self) -> int:
         """Play the robot's frames until the session is established; return how many frames that took."""
@@ -161,7 +178,7 @@ class Rehearsal:
         self._heard_at = self.now
         for message in self.session.receive(frame, self.now):
             with contextlib.suppress(ProtocolError):
-                list(self.robot.telemetry(message, 1))
+                self.shown += self.robot.telemetry(message, 1)
         if self.session.state is State.ESTABLISHED and not self._begun:
             self._begun = True
             self.robot.begun(1)

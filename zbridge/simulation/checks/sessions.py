@@ -37,8 +37,9 @@ def check_sessions(protocol: Protocol, recording: Transcript) -> Iterator[CheckF
     claim = f"{len(recording.messages)} messages of the robot are translated"
     yield CheckFinding.of(claim, _translated(protocol, recording), guide="5. Telemetry")
     count = recording.unanswered
-    without = f"{count} had no answer in time: see expects, answers and frame_end" if count else None
-    yield CheckFinding("the simulated robot answers every request", without, guide=_GUIDE)
+    if count is not None:
+        without = f"{count} had no answer in time: see expects, answers and frame_end" if count else None
+        yield CheckFinding("the simulated robot answers every request", without, guide=_GUIDE)
     try:
         steps = _steps(protocol, recording)
     except Exception as error:
@@ -53,7 +54,8 @@ def check_sessions(protocol: Protocol, recording: Transcript) -> Iterator[CheckF
     find = partial(_falls_silent, claim, protocol, recording)
     yield CheckFinding.tried(claim, find, "Session.busy, or its end", _STREAMING)
     claim = "the keep-alive is written in time for the robot's watchdog"
-    yield CheckFinding.tried(claim, partial(_kept_alive, claim, protocol, recording), "a keep-alive", _STREAMING)
+    if Rehearsal(protocol, recording).session.keep_alive is not None:
+        yield CheckFinding.tried(claim, partial(_kept_alive, claim, protocol, recording), "a keep-alive", _STREAMING)
 
 
 def _falls_silent(claim: str, protocol: Protocol, recording: Transcript) -> CheckFinding:
@@ -79,8 +81,7 @@ def _kept_alive(claim: str, protocol: Protocol, recording: Transcript) -> CheckF
     rehearsal = Rehearsal.established(protocol, recording)
     session, keep_alive = rehearsal.session, rehearsal.session.keep_alive
     kind = type(session).__qualname__
-    if keep_alive is None:
-        return CheckFinding.not_checked(claim, f"{kind}.keep_alive is None: the robot has no watchdog that needs one")
+    assert keep_alive is not None
     if keep_alive.period_s > keep_alive.watchdog_s / 2:
         problem = (
             f"{kind}.keep_alive.period_s is {keep_alive.period_s:g}, expected {keep_alive.watchdog_s / 2:g} or less"

@@ -11,11 +11,12 @@ from collections.abc import AsyncIterator, Iterator
 from functools import partial
 from typing import Any
 
-from zbridge.errors import FAULT, ProtocolError, Refused, describe
+from zbridge.errors import FAULT, NotReady, ProtocolError, Refused, describe
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Mode, Motion, Pose, Scan
 from zbridge.fleet.topics import Topic
 from zbridge.protocol.address import Address
+from zbridge.protocol.exchange import ExchangeSession
 from zbridge.protocol.plugin import Protocol, Simulation, Truth
 from zbridge.protocol.session import Session, State
 from zbridge.simulation.checks.finding import SimulatorFault
@@ -30,51 +31,58 @@ AGAIN_S = 0.1
 """Seconds between two drives, as programs repeat them."""
 _LOOK_S = 0.01
 _HANDLED = "ProtocolError for what a robot must not say, and no other exception"
+MOST_RECEIVED = 600
 _MOST_FRAMES = 400
 _ANSWER_FRAMES = 8
+_LAST = 3
 
 
 class Stage:
     """A robot object with a conversation on each link of the simulated robot; what it shows, and how it really is."""
 
-    def __init__(self, protocol: Protocol, simulated: asyncio.Future[Any], truths: list[tuple[float, Truth]]) -> None:
+    def __init__(self, protocol: Protocol, device: RunningRobot) -> None:
         self._protocol = protocol
-        self._simulated = simulated
-        self._addresses: tuple[Address, ...] = ()
+        self.device = device
         self.fault: str | None = None
         """What the simulated robot raised."""
         self.robot = robot_of(protocol)
         self.sessions: list[Session[Any]] = []
         self.frames: list[tuple[str, bytes]] = []
         """The frames of the first link: ``in`` or ``out``, and the frame."""
+        self.received: list[bytes] = []
+        """The frames of the first link's first connection, up to :data:`MOST_RECEIVED`."""
         self.messages: list[Any] = []
         """The messages that the sessions passed on."""
         self.shown: list[tuple[Topic, FleetMessage]] = []
         """Telemetry since everything was forgotten last."""
         self.history: list[tuple[Topic, FleetMessage]] = []
         """All telemetry."""
-        self.truths = truths
+        self.truths = device.truths
         """How the simulated robot was, and when; empty: it does not say."""
         self._conversations: list[Conversation] = []
         self._loop = asyncio.get_running_loop()
 
     # The conversation
 
-    async def connect(self, addresses: tuple[Address, ...] = ()) -> None:
-        """Begin a conversation with each link of the simulated robot; the second time with the same."""
-        self._addresses = addresses or self._addresses
-        names = self.robot.link_names
-        if len(names) != len(self._addresses):
+    async def connect(self) -> None:
+        """Begin a conversation with each link of the simulated robot."""
+        addresses, names = await self.device.listens(), self.robot.link_names
+        if len(names) != len(addresses):
             kind = type(self.robot).__qualname__
-            raise ValueError(f"{kind}.link_names: {names}, expected {len(self._addresses)} of them (Protocol.links)")
+            raise ValueError(f"{kind}.link_names: {names}, expected {len(addresses)} of them (Protocol.links)")
         self.sessions, self._conversations = [], []
-        for name, address in zip(names, self._addresses, strict=True):
+        for name, address in zip(names, addresses, strict=True):
             session = self.robot.session(name, str(address))
             if not self.sessions:
-                session.tap = lambda direction, frame: self.frames.append((direction, frame))
+                session.tap = partial(self._tapped, keep=not self.received)
             self.sessions.append(session)
             self._conversations.append(Conversation(session, self._loop, ConversationHooks(deliver=self._deliver)))
             await connect(self._protocol.device_address(str(address)), self._conversations[-1])
+
+    def _tapped(self, direction: str, frame: bytes, *, keep: bool) -> None:
+        self.frames.append((direction, frame))
+        if keep and direction == "in" and len(self.received) < MOST_RECEIVED:
+            self.received.append(frame)
 
     def _deliver(self, messages: list[Any]) -> None:
         self.messages += messages
@@ -97,8 +105,8 @@ class Stage:
 
     def raise_fault(self) -> None:
         """Raise SimulatorFault if the simulated robot raised an exception, or ended."""
-        if self._simulated.done():
-            error = self._simulated.exception()
+        if self.device.running.done():
+            error = self.device.running.exception()
             self.fault = f"raised {describe(error)}" if error is not None else "ended: simulate() returned"
         if self.fault is not None:
             raise SimulatorFault(f"the simulated robot {self.fault}; expected it to serve until it is cancelled")
@@ -110,11 +118,23 @@ class Stage:
             if session.over:
                 reason = session.reason or "no reason given"
                 expected = f"; expected {_HANDLED}" if reason.startswith(FAULT) else ""
-                yield f"{which}: ended: {reason}{expected}"
+                yield f"{which}: ended: {reason}; {self._exchanged()}{expected}"
             elif session.state is not State.ESTABLISHED:
                 malformed = f", last malformed: {session.last_malformed}" if session.last_malformed else ""
                 still = f"still {session.state.value} after {within_s:g} s{malformed}"
-                yield f"{which}: {still}; expected Session.establish"
+                yield f"{which}: {still}; {self._exchanged()}; expected Session.establish"
+
+    def _exchanged(self) -> str:
+        """Show the last frames of both directions."""
+        last = {way: [frame for direction, frame in self.frames if direction == way][-_LAST:] for way in ("out", "in")}
+        written, received = (", ".join(map(repr, last[way])) or "nothing" for way in ("out", "in"))
+        return f"last written: {written}; last received: {received}"
+
+    @property
+    def trouble(self) -> str | None:
+        """Why the robot takes no commands now."""
+        kinds = ((type(each).__qualname__, each.busy or (each.over and each.reason)) for each in self.sessions)
+        return next((f"{kind} takes no commands: {why}" for kind, why in kinds if why), None)
 
     def pump(self) -> None:
         for conversation in self._conversations:
@@ -138,9 +158,11 @@ class Stage:
         self.pump()
 
     async def drive(self, seconds: float, forward: float = 0.0, turn: float = 0.0) -> None:
-        """Repeat a drive for so long; raise Refused."""
+        """Repeat a drive for so long; raise Refused, as a gateway does where the robot is busy."""
         end = self.now() + seconds
         while self.now() < end:
+            if not self.robot.ready:
+                raise NotReady(self.trouble or "the session is not established")
             self.robot.command(topics.CMD_DRIVE, Drive(forward=forward, turn=turn), self.now())
             await self.watch(min(AGAIN_S, max(0.0, end - self.now())))
 
@@ -188,39 +210,64 @@ class Stage:
         return self.truths[-1][1] if self.truths else None
 
 
+class RunningRobot:
+    """The simulated robot of a protocol, running: it can be switched off and on. ``truths``: how it was, and when."""
+
+    def __init__(self, protocol: Protocol, place: tuple[float, float, float] | None, *, at_wrap: bool) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._protocol, self._at_wrap = protocol, at_wrap
+        self.truths: list[tuple[float, Truth]] = []
+        self.addresses = tuple(Address("127.0.0.1", 0) for _ in range(protocol.links))
+        self.switch_on(place)
+
+    def switch_on(self, place: tuple[float, float, float] | None) -> None:
+        """Start it, at the addresses that it had before."""
+        self.ready: asyncio.Future[tuple[Address, ...]] = self._loop.create_future()
+        simulation = Simulation(
+            self.addresses,
+            ready=self._on_ready,
+            place=place,
+            at_wrap=self._at_wrap,
+            report=lambda truth: self.truths.append((self._loop.time(), truth)),
+        )
+        self.running = asyncio.ensure_future(self._protocol.simulate(simulation))
+
+    def _on_ready(self, bound: tuple[Address, ...]) -> None:
+        if not self.ready.done():
+            self.ready.set_result(bound)
+
+    async def listens(self) -> tuple[Address, ...]:
+        """Wait until it listens, and return where; raise what it raises, TimeoutError if it never says."""
+        parts: tuple[asyncio.Future[Any], ...] = (self.running, self.ready)
+        await asyncio.wait(parts, timeout=5.0, return_when=asyncio.FIRST_COMPLETED)
+        if self.running.done():
+            self.running.result()
+        if not self.ready.done():
+            raise TimeoutError("the simulated robot does not say where it listens (Simulation.ready)")
+        self.addresses = self.ready.result()
+        return self.addresses
+
+    async def switch_off(self) -> None:
+        """End it."""
+        self.running.cancel()
+        await asyncio.wait([self.running])
+
+
 @contextlib.asynccontextmanager
 async def live(
     protocol: Protocol, *, place: tuple[float, float, float] | None = None, at_wrap: bool = False
 ) -> AsyncIterator[Stage]:
     """Run the simulated robot on loopback and connect to it."""
-    loop = asyncio.get_running_loop()
-    ready: asyncio.Future[tuple[Address, ...]] = loop.create_future()
-    addresses = tuple(Address("127.0.0.1", 0) for _ in range(protocol.links))
-    truths: list[tuple[float, Truth]] = []
-    simulation = Simulation(
-        addresses,
-        ready=ready.set_result,
-        place=place,
-        at_wrap=at_wrap,
-        report=lambda truth: truths.append((loop.time(), truth)),
-    )
-    simulated = asyncio.ensure_future(protocol.simulate(simulation))
-    stage = Stage(protocol, simulated, truths)
+    device = RunningRobot(protocol, place, at_wrap=at_wrap)
+    stage, loop = Stage(protocol, device), asyncio.get_running_loop()
     loop.set_exception_handler(partial(_on_fault, stage, loop.get_exception_handler()))
     try:
-        parts: tuple[asyncio.Future[Any], ...] = (simulated, ready)
-        await asyncio.wait(parts, timeout=5.0, return_when=asyncio.FIRST_COMPLETED)
-        if simulated.done():
-            simulated.result()
-        if not ready.done():
-            raise TimeoutError("the simulated robot does not say where it listens (Simulation.ready)")
-        await stage.connect(ready.result())
+        await stage.connect()
         yield stage
     finally:
         stage.close()
         await asyncio.sleep(HANG_UP_S)
-        simulated.cancel()
-        await asyncio.wait([simulated])
+        await device.switch_off()
 
 
 def _on_fault(stage: Stage, other: Any, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
@@ -245,8 +292,14 @@ async def record(protocol: Protocol, establish_s: float) -> Transcript:
             list(stage.messages),
             established,
             None if established else "; ".join(stage.lacking(establish_s)),
-            sum(session.traffic.unanswered for session in stage.sessions),
+            _unanswered(stage),
         )
+
+
+def _unanswered(stage: Stage) -> int | None:
+    """Count the requests without an answer; None: no session sends requests."""
+    asking = [session for session in stage.sessions if isinstance(session, ExchangeSession)]
+    return sum(session.traffic.unanswered for session in asking) if asking else None
 
 
 def _answers(frames: list[tuple[str, bytes]]) -> dict[bytes, list[bytes]]:

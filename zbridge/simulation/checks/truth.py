@@ -55,7 +55,7 @@ class Leg(msgspec.Struct, frozen=True, kw_only=True):
     """A drive, and how it ended. shown: None where no pose is shown. true: None where the simulator does not say.
 
     steady_m_s, steady_rad_s: the true speed and turn rate at the end of the drive. wheels_m_s: as of :class:`Truth`,
-    then. speeds: what ``motion`` showed at the end of the drive. refused: the code, if the drive was refused.
+    then. speeds: what ``motion`` showed at the end of the drive. refused: why, if the drive was refused.
     """
 
     seconds: float
@@ -79,7 +79,7 @@ async def leg(
     try:
         await stage.drive(seconds, forward, turn)
     except Refused as refusal:
-        refused = str(refusal.code)
+        refused = f"{refusal.code}: {refusal}"
     ended, speeds, written = stage.now(), tuple(stage.speeds[-3:]), frozenset(stage.written)
     steady = [entry for entry in stage.truths if ended - STEADY_S <= entry[0] <= ended]
     if stop:

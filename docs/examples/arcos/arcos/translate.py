@@ -82,8 +82,10 @@ class ArcosRobot(protocol.RobotSide):
         return _motion(0, 0)
 
     def leased(self, on: bool, now: float) -> None:
-        send = self.connected().send_first if on else self.connected().send  # before the first drive, behind the stop
-        send(Setting.of(Do.ENABLE, int(on)))
+        enable = write(Setting.of(Do.ENABLE, int(on)))
+        self.connected().outbox.set(
+            "motors", (enable,), -math.inf
+        )  # before the drive, behind a stop; the newest counts
 
     def ask(self, topic: Topic) -> None:
         raise protocol.Unsupported(f"an ARCOS robot cannot be queried for its {topic.path}")

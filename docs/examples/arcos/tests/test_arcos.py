@@ -142,6 +142,15 @@ def test_the_motors_are_on_while_a_program_has_the_lease() -> None:
     assert not scene.simulated.motors
 
 
+def test_motors_are_on_for_a_lease_that_follows_another_one_while_the_line_is_busy(scene: Scene) -> None:
+    scene.stop()
+    scene.lease(False)
+    scene.lease(True)
+    scene.run(STEP_S)
+    assert scene.written[:3] == [*STOP, MOTORS_ON]
+    assert scene.simulated.motors
+
+
 def test_the_pulse_keeps_the_robot_moving_and_without_it_the_watchdog_stops_it(scene: Scene) -> None:
     scene.drive(0.2)
     scene.run(4.0)

@@ -1,9 +1,10 @@
 """ARCOS: Pioneer robots of MobileRobots; two wheels, sonars and bumpers, on a serial line or TCP."""
 
-from arcos.messages import PACKETS, Command, Do, Report, Setting, Sonar, Synced, read, read_command, write
-from arcos.translate import ArcosRobot, Options
 from zbridge.fleet.messages import Drive
 from zbridge.protocol import Codec, Example, Protocol, Simulation
+
+from arcos.messages import PACKETS, Command, Do, Report, Setting, Sonar, Synced, read, read_command, write
+from arcos.translate import ArcosRobot, Options
 
 TEMPLATE = """\
 [device]

@@ -2,9 +2,10 @@
 
 from typing import Any, ClassVar
 
-from arcos.messages import PACKETS, Command, Do, Report, Setting, Synced, read, write
 from zbridge.protocol import KeepAlive, ProtocolError, Role, Session, State
 from zbridge.wire import Message
+
+from arcos.messages import PACKETS, Command, Do, Report, Setting, Synced, read, write
 
 SYNC_S = 0.5  # a SYNC without an answer is repeated
 

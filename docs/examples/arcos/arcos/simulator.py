@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-
-from arcos.messages import PACKETS, Command, Do, Report, Setting, Sonar, Synced, read_command, write
-from arcos.translate import BEARINGS_DEG, BUMPERS, FULL_TURN, MM_PER_M, WRAP
 from zbridge.protocol import ProtocolError, Simulation, Truth
 from zbridge.simulation import SimulatedRobot, serve
 from zbridge.simulation.world import Body, cast
 from zbridge.wire import FrameBuffer, Message
+
+from arcos.messages import PACKETS, Command, Do, Report, Setting, Sonar, Synced, read_command, write
+from arcos.translate import BEARINGS_DEG, BUMPERS, FULL_TURN, MM_PER_M, WRAP
 
 REPORT_S, WATCHDOG_S = 0.1, 2.0
 TRACK_M, RADIUS_M, RING_M, RANGE_M = 0.33, 0.22, 0.2, 5.0

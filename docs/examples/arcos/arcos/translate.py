@@ -4,12 +4,13 @@ import math
 from collections.abc import Iterator
 from typing import Any, ClassVar, Literal
 
-from arcos.messages import PACKETS, Do, Report, Setting, write
-from arcos.session import ArcosSession
 from zbridge import protocol
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Battery, Drive, FleetMessage, Motion, Reading
 from zbridge.fleet.topics import Topic
+
+from arcos.messages import PACKETS, Do, Report, Setting, write
+from arcos.session import ArcosSession
 
 MM_PER_M, WRAP, FULL_TURN = 1000, 2**16, 4096
 AGAIN_S, STOP_AGAIN_S = 0.5, 0.1

@@ -14,11 +14,11 @@ import tty
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
-from arcos.simulator import Arcos
-
 import zbridge
 from zbridge.errors import BusError, Refused
 from zbridge.simulation import STEP_S
+
+from arcos.simulator import Arcos
 
 WAIT_S = 20.0
 

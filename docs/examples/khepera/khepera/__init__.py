@@ -1,9 +1,10 @@
 """Khepera: a small robot with two wheels, eight proximity sensors and LEDs, on a serial line or TCP."""
 
-from khepera.messages import LINES, Positions, Proximity, SetLed, SetSpeeds, Speeds, Version
-from khepera.translate import KheperaRobot, Options
 from zbridge.fleet.messages import Drive
 from zbridge.protocol import Codec, Example, Protocol, Simulation
+
+from khepera.messages import LINES, Positions, Proximity, SetLed, SetSpeeds, Speeds, Version
+from khepera.translate import KheperaRobot, Options
 
 TEMPLATE = """\
 [device]
@@ -31,6 +32,8 @@ EXAMPLES = (
     Example("lines", b"b,5,1\n", Version(5, 1), source=MANUAL),
     Example("lines", b"e,25,25\n", Speeds(25, 25), {"motion.speed": 0.4}, source=MANUAL),
     Example("lines", b"h,-100,2147483647\n", Positions(-100, 2**31 - 1), source=MANUAL),
+    Example("lines", b"h,12500,12500\n", Positions(12500, 12500), {"pose.x": 1.0}, before=(b"h,0,0\n",), source=MANUAL),
+    Example("lines", b"D,-3,3\n", SetSpeeds(-3, 3), command=Drive(turn=1.0), source="1 rad/s * 26.5 mm is 26.5 mm/s"),
     Example("lines", b"n,0,1,2,3,4,5,6,1023\n", Proximity(0, 1, 2, 3, 4, 5, 6, 1023), source=MANUAL),
 )
 

@@ -1,8 +1,9 @@
 """The conversation: one request at a time, the version first, then polls at 20 Hz. Sans-IO."""
 
-from khepera.messages import LINES, ReadPositions, ReadProximity, ReadSpeeds, ReadVersion, Version
 from zbridge.protocol import ExchangeSession, Role
 from zbridge.wire import Line
+
+from khepera.messages import LINES, ReadPositions, ReadProximity, ReadSpeeds, ReadVersion, Version
 
 POLL_S, VERSION_S = 0.05, 0.5
 _POLLS = {"positions": ReadPositions(), "speeds": ReadSpeeds(), "proximity": ReadProximity()}

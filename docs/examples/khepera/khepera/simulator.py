@@ -5,6 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from zbridge.protocol import ProtocolError, Simulation, Truth
+from zbridge.simulation import SimulatedRobot, serve
+from zbridge.simulation.world import Body, cast
+from zbridge.wire import FrameBuffer, Line
 
 from khepera.messages import (
     LINES,
@@ -22,10 +26,6 @@ from khepera.messages import (
     Version,
 )
 from khepera.translate import BEARINGS_DEG, DISTANCE_M, LIGHT, PULSE_M, STILL, UNIT_M_S, WRAP
-from zbridge.protocol import ProtocolError, Simulation, Truth
-from zbridge.simulation import SimulatedRobot, serve
-from zbridge.simulation.world import Body, cast
-from zbridge.wire import FrameBuffer, Line
 
 SILENCE_S = 1.0
 """Seconds without a request after which it stops."""

@@ -4,13 +4,13 @@ from typing import Any
 
 import msgspec
 import numpy as np
-
-from khepera.messages import LINES, Positions, Proximity, SetLed, SetSpeeds, Speeds
-from khepera.session import KheperaSession
 from zbridge import protocol
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Motion, Switch
 from zbridge.fleet.topics import Topic
+
+from khepera.messages import LINES, Positions, Proximity, SetLed, SetSpeeds, Speeds
+from khepera.session import KheperaSession
 
 UNIT_M_S, MOST_UNITS, PULSE_M, WRAP = 0.008, 127, 0.00008, 2**32
 AGAIN_S, STOP_AGAIN_S = 0.5, 0.1

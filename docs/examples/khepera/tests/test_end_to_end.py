@@ -14,12 +14,12 @@ import tty
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
-from khepera.messages import SetSpeeds
-from khepera.simulator import Khepera
-
 import zbridge
 from zbridge.errors import BusError, Refused
 from zbridge.simulation import STEP_S
+
+from khepera.messages import SetSpeeds
+from khepera.simulator import Khepera
 
 WAIT_S = 20.0
 

@@ -5,17 +5,17 @@ from __future__ import annotations
 import math
 
 import pytest
-from khepera import PROTOCOL
-from khepera.messages import LINES, Positions, Proximity, SetLed, SetSpeeds, Speeds, Version
-from khepera.session import KheperaSession
-from khepera.simulator import Khepera
-from khepera.translate import KheperaRobot, Options
-
 from zbridge.errors import EncodeError, ProtocolError, Refused
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, Mode, Switch
 from zbridge.protocol import State
 from zbridge.simulation import STEP_S, Scene
+
+from khepera import PROTOCOL
+from khepera.messages import LINES, Positions, Proximity, SetLed, SetSpeeds, Speeds, Version
+from khepera.session import KheperaSession
+from khepera.simulator import Khepera
+from khepera.translate import KheperaRobot, Options
 
 
 @pytest.fixture

@@ -252,8 +252,8 @@ MUTANTS = (
         "a reconnected robot is not stopped",
         "situations",
         PRESENCE,
-        "            self._standstill.stop()\n        for topic",
-        "            pass\n        for topic",
+        "            self._standstill.stop()\n        self._enforcer.lease_hook",
+        "            pass\n        self._enforcer.lease_hook",
     ),
     # ownership
     Mutant(

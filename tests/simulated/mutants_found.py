@@ -139,8 +139,8 @@ FOUND = (
     _mutant(
         "a gateway that yielded continues repeating its stop",
         "zbridge/protocol/outbox.py",
-        "            for place in (self._queue, self._urgent, self._slots):\n",
-        "            for place in (self._queue, self._urgent):\n",
+        "            self._clear_slots()\n",
+        "            pass\n",
     ),
     _mutant(
         "the stop of a gateway that serves its robot again comes before it may write",

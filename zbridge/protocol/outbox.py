@@ -17,8 +17,8 @@ Four places for frames. ``take`` serves them in this order:
 
 Fairness: the slot that has been due longest goes first; slots and queue take turns frame by frame, so that neither
 a stream of motion nor a full queue starves the other. A group that replaces one of the same length continues at the
-position of the old one, and is sent whole from there: if a group of motors is replaced faster than it is written, each
-motor is still served.
+position of the old one, and is sent whole from there, unless it is the same: if a group of motors is replaced faster
+than it is written, each motor is still served.
 
 The slot :data:`KEEP_ALIVE` is sent while the outbox is muted, too, and nothing but :meth:`Outbox.clear` empties it.
 
@@ -182,6 +182,8 @@ class Outbox(Kept):
                 del self._slots[slot]
         elif old is not None and len(old.frames) == len(frames):
             new.position = old.position
+            if old.frames == frames:  # it goes on
+                new.sent = old.sent
 
     def prolong(self, slot: str, frames: tuple[bytes, ...], *, period_s: float, until: float) -> bool:
         """Repeat what ``slot`` holds until then, on its existing schedule; False if it holds other frames.

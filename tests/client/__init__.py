@@ -51,7 +51,8 @@ class Machine(RobotSide):
 
     @property
     def driving(self) -> Any:
-        return SimpleNamespace(over=False, busy=None, doubts=(), doubtful=None, state=State.ESTABLISHED)
+        outbox = SimpleNamespace(muted=False)
+        return SimpleNamespace(over=False, busy=None, doubts=(), doubtful=None, state=State.ESTABLISHED, outbox=outbox)
 
     def translator(self, kind: type) -> Any:
         raise NotImplementedError

@@ -158,3 +158,33 @@ def test_another_process_goes_on_with_the_silence_and_the_keep_alive(silent_for:
     assert heir.busy == SILENT
     run(heir, 11.9, 12.1)
     assert heir.reason == LOST
+
+
+def test_a_time_in_which_nothing_was_read_is_no_silence() -> None:
+    session = established()
+    session.silence.restart(11.9)
+    run(session, 11.9, 12.3)
+    assert session.busy is None
+    run(session, 12.3, 12.5)
+    assert session.busy == SILENT
+
+
+def test_a_closing_session_has_no_deadline_in_the_past() -> None:
+    session = established()
+    session.outbox.put(b"last")
+    session.close("bye", 10.1)
+    assert session.deadline(writing=False) == 10.6
+
+
+def test_a_session_closes_once_the_slots_that_are_due_are_written() -> None:
+    class Slow(Streaming):
+        keep_alive = None
+
+    session = Slow(Limits(frame_bytes=10, handshake_s=5.0, gap_s=0.1))
+    session.open(0.0)
+    session.receive(b"x", 0.0)
+    session.outbox.set("motors", (b"1", b"2"), 0.0)
+    session.close("bye", 0.0)
+    assert [session.outgoing(0.0), session.outgoing(0.05)] == [b"1", None]
+    assert (session.outgoing(0.1), session.state) == (b"2", State.CLOSING)
+    assert (session.outgoing(0.3), session.state) == (None, State.CLOSED)

@@ -4,6 +4,7 @@ import math
 
 import pytest
 
+from zbridge.errors import ProtocolError
 from zbridge.protocol.kinematics import Odometry
 
 
@@ -64,3 +65,17 @@ def test_a_pose_survives_a_restart_of_the_gateway() -> None:
         odometry.sides(way, way, 1)
     heir.restore(odometry.export())
     assert heir.sides(4.0, 4.0, 1).x == 3.0
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_numbers_that_are_not_finite_are_refused_and_leave_the_pose_as_it_was(bad: float) -> None:
+    odometry = Odometry(0.5, wrap=2**16)
+    odometry.sides(0, 0, 1)
+    for broken in (
+        lambda: odometry.sides(bad, 1, 1),
+        lambda: odometry.placed(0, bad, 0, 1),
+        lambda: odometry.moved(bad, 0, 1),
+    ):
+        with pytest.raises(ProtocolError, match="expected finite numbers"):
+            broken()
+    assert odometry.sides(2, 2, 1).x == 2.0

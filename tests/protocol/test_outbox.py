@@ -1,8 +1,11 @@
 """The outbox: one frame at a time, spaced, bounded, the newest motion first."""
 
+import itertools
+
 import pytest
 
 from zbridge.errors import Refused
+from zbridge.protocol.exchange import Exchange
 from zbridge.protocol.outbox import LIMIT, Outbox
 
 
@@ -240,3 +243,51 @@ def test_groups_that_are_replaced_faster_than_they_are_written_starve_no_frame()
         outbox.set("wheels", (b"a%d" % step, b"b%d" % step), step * 0.1)
         taken.append(outbox.take(step * 0.1))
     assert taken == [b"a0", b"b1", b"a2", b"b3", b"a4", b"b5"]
+
+
+def test_motion_that_a_program_repeats_keeps_its_turn_among_polls_that_fill_the_line() -> None:
+    exchange = Exchange(0.2)
+    for name in ("a", "b", "c"):
+        exchange.set(name, (name.encode(),), 0.0, period_s=0.05, lasting=True)
+    written, now, answered_at = [], 0.0, 0.0
+    for step in range(1000):
+        now = step / 100
+        if step % 5 == 0:
+            exchange.set("drive", (b"drive%d" % step,), now)
+        if exchange.awaited is not None and now >= answered_at:
+            exchange.answered()
+        frame = exchange.take(now)
+        if frame is not None:
+            answered_at = now + 0.04
+            written.append((now, frame))
+    drives = [at for at, frame in written if frame.startswith(b"drive")]
+    assert len(drives) > 50
+    assert max(later - before for before, later in itertools.pairwise(drives)) < 0.3
+
+
+def test_polls_are_written_while_muted_and_survive_what_forgets_motion() -> None:
+    outbox = Outbox(0.0)
+    outbox.set("poll", (b"p",), 0.0, period_s=1.0, lasting=True)
+    outbox.set("drive", (b"d",), 0.0, period_s=1.0)
+    outbox.mute(True)
+    outbox.forget()
+    play(outbox, "from 0 to 2.5 = 0:p 1:p 2:p")
+    outbox.mute(False)
+    play(outbox, "from 3 to 3.5 = 3:p")
+
+
+def test_a_stop_waits_while_an_answer_is_awaited() -> None:
+    exchange = Exchange(0.2)
+    exchange.put(b"question")
+    assert exchange.take(0.0) == b"question"
+    assert not exchange.waits(0.0)
+    exchange.set("drive", (b"stop",), 0.0, until=0.0, urgent=True)
+    assert exchange.waits(0.0)
+
+
+def test_another_process_sends_the_rest_of_a_group_that_replaced_one_halfway() -> None:
+    outbox, heir = Outbox(0.1), Outbox(0.1)
+    play(outbox, "set wheels a b at 0; take 0 = a; set wheels c d at 0.01")
+    heir.restore(outbox.export())
+    for each in (outbox, heir):
+        play(each, "from 0.1 to 1 = 0.1:d 0.2:c; due never")

@@ -367,7 +367,7 @@ AHEAD, SPEED, RATE = "it drives ahead after a turn", "it drives as fast as", "it
         (broken(options=Sized), {}),
         (
             broken(options=Sized, simulated={"speed_full_m_s": 10.0, "turn_full_rad_s": 10.0}),
-            {SPEED: "m/s, the options say 4.000 m/s", RATE: "rad/s, the options say 10.000 rad/s"},
+            {SPEED: "m/s, the options say 0.8", RATE: "rad/s, the options say 6.667 rad/s"},
         ),
     ],
     ids=["does not move", "does not stand", "goes the other way", "as the options say", "not as the options say"],

@@ -53,5 +53,7 @@ def test_what_is_no_message_is_told() -> None:
         COMMANDS.read(b"\x89\x01")
     with pytest.raises(EncodeError, match="Drive"):
         COMMANDS.write(Drive(40_000, 0))
-    with pytest.raises(TypeError, match="an opcode stands twice"):
+    with pytest.raises(EncodeError, match="is none of the messages"):
+        COMMANDS.write(Stream(0, b""))
+    with pytest.raises(TypeError, match="duplicate opcode"):
         Opcodes((Start, Start))

@@ -127,3 +127,9 @@ def test_what_is_no_packet_is_named_with_its_bytes() -> None:
 def test_a_damaged_packet_is_made_whole_for_fuzzing() -> None:
     whole = PACKETS.packet(b"abc")
     assert PACKETS.body(PACKETS.seal(whole[:4] + b"X" + whole[5:])) == b"aXc"
+
+
+def test_packets_without_a_checksum_are_read_too() -> None:
+    packets = Packets(b"\xaa", "B", uncounted=2, checksum=lambda data: b"", most=20)
+    assert packets.body(packets.packet(b"abc")) == b"abc"
+    assert packets.end(packets.packet(b"abc"), 0) == 5

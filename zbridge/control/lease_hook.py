@@ -14,7 +14,7 @@ class LeaseHook:
     def __init__(self, context: RobotContext, authority: Authority) -> None:
         self._context = context
         self._authority = authority
-        self._told: bool | None = False
+        self._told: bool | None = None
         """What the protocol knows; None: it must be told whatever holds."""
         self._refused = self._left = False
 
@@ -41,6 +41,8 @@ class LeaseHook:
     def _tell(self, leased: bool, *, anew: bool = False) -> None:
         session = self._context.robot.driving
         if (leased is self._told and not anew) or session is None or session.state is not State.ESTABLISHED:
+            return
+        if session.outbox.muted:  # another gateway serves the robot
             return
         self._told, self._refused = leased, False
         try:

@@ -165,7 +165,7 @@ class ExchangeSession(Session[M]):
 
     def poll(self, slot: str, request: M, now: float, period_s: float) -> None:
         """Send a request now, and again every ``period_s`` seconds; a newer one of the same slot replaces it."""
-        self.outbox.set(slot, (self.encode(request),), now, period_s=period_s)
+        self.outbox.set(slot, (self.encode(request),), now, period_s=period_s, lasting=True)
 
     def unpoll(self, slot: str) -> None:
         """End a poll."""

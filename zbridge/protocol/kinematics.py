@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar
 
 import msgspec
 
-from zbridge.errors import Unsupported
+from zbridge.errors import ProtocolError, Unsupported
 from zbridge.fleet.messages import Drive, Pose
 from zbridge.protocol.kept import Kept
 
@@ -110,7 +110,11 @@ class Odometry(Kept):
         return self.moved(0.0, math.remainder(heading_rad - heading_before, 2 * math.pi), stamp_ns)
 
     def moved(self, way_m: float, turned_rad: float, stamp_ns: int) -> Pose:
-        """Return the pose after a path of ``way_m`` on which the robot turned by ``turned_rad``, counter-clockwise."""
+        """Return the pose after a path of ``way_m`` on which the robot turned by ``turned_rad``, counter-clockwise.
+
+        Raise ProtocolError for numbers that are not finite, as the other methods do; the pose stays as it was.
+        """
+        _require_finite(way_m, turned_rad)
         along = self._heading + turned_rad / 2
         self._x += way_m * math.cos(along)
         self._y += way_m * math.sin(along)
@@ -119,6 +123,7 @@ class Odometry(Kept):
 
     def _since(self, counted: tuple[float, ...]) -> tuple[float, ...]:
         """Note what is counted now; return what was before, the same where the counters begin."""
+        _require_finite(*counted)
         before, self._counted = self._counted or counted, counted
         return before
 
@@ -126,3 +131,8 @@ class Odometry(Kept):
         """Return the distance between two values of a counter, the shorter way where it wraps."""
         way = counter - before
         return (way if self._wrap is None else math.remainder(way, self._wrap)) * self._unit_m
+
+
+def _require_finite(*numbers: float) -> None:
+    if not all(map(math.isfinite, numbers)):
+        raise ProtocolError(f"{numbers}: expected finite numbers")

@@ -2,8 +2,8 @@
 
 Theory of operation. A watch begins when a session is established, at the next timer. Every message that could be read
 is a sign of life; noise is none. After ``silent_s`` without one the robot is not driven, after ``lost_s`` the session
-ends. A conversation reads what waits before it runs timers that are late, so a process that was paused does not take
-its own pause for the robot's.
+ends. A conversation reads what waits before it runs timers that are late, and restarts the watch when it reads again
+after a pause, so a gateway does not take its own pause for the robot's.
 """
 
 from __future__ import annotations
@@ -50,6 +50,11 @@ class SilenceWatch(Kept):
     def begin(self) -> None:
         """Begin to watch, from the next :meth:`judge` or sign of life on."""
         self._heard_at = -math.inf if self.on else math.inf
+
+    def restart(self, now: float) -> None:
+        """Count from now: until now nothing was read, so nothing could come."""
+        if self._heard_at < math.inf:
+            self._heard_at = max(self._heard_at, now)
 
     def heard(self, now: float, busy: str | None) -> str | None:
         """Note a sign of life. Return ``busy``, None if this watch had set it."""

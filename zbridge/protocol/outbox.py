@@ -20,7 +20,8 @@ a stream of motion nor a full queue starves the other. A group that replaces one
 position of the old one, and is sent whole from there, unless it is the same: if a group of motors is replaced faster
 than it is written, each motor is still served.
 
-The slot :data:`KEEP_ALIVE` is sent while the outbox is muted, too, and nothing but :meth:`Outbox.clear` empties it.
+Polls and the slot :data:`KEEP_ALIVE` are sent while the outbox is muted, too: they keep the connection alive. Nothing
+but :meth:`Outbox.clear` empties them.
 
 Bounds: queue and exempt refuse a frame beyond ``limit``; urgent keeps the newest ``URGENT`` frames; a slot holds one
 group, and a protocol names a fixed number of slots.
@@ -56,6 +57,7 @@ class _Group(msgspec.Struct):
     position: int = 0
     sent: int = 0
     """Frames of this round that have left."""
+    lasting: bool = False
 
     def step(self, now: float) -> bytes:
         """Return the next frame of the group."""
@@ -110,10 +112,14 @@ class Outbox(Kept):
         """Whether frames of a stop, or of a handshake, still wait."""
         return bool(self._urgent or self._exempt)
 
+    @property
+    def muted(self) -> bool:
+        """Whether only what keeps the connection alive is written."""
+        return self._muted
+
     def waits(self, now: float) -> bool:
-        """Return whether a frame waits for its turn, or for the gap; repetitions that are not due yet do not wait."""
-        deadline = self.deadline()
-        return deadline is not None and deadline <= now + self.gap_s
+        """Return whether a frame waits: for its turn, an answer, the gap. Repetitions that are not due do not wait."""
+        return bool(self) or any(group.due <= now + self.gap_s for group in self._slots.values())
 
     def put(self, frame: bytes) -> None:
         """Queue a frame that is sent once; raise Refused when ``limit`` frames wait."""
@@ -162,28 +168,32 @@ class Outbox(Kept):
         until: float = math.inf,
         spacing_s: float = 0.0,
         urgent: bool = False,
+        lasting: bool = False,
     ) -> None:
         """Put a group of frames into ``slot``, in place of the one there.
 
         The group is due at ``now``, then every ``period_s`` until ``until``; without a period it is sent once.
         ``spacing_s``: between two of its frames, where it is not urgent; else the gap of the outbox.
         ``urgent``: queue it before all slots, to leave whole; the slot holds its repetitions, none if ``until`` is not
-        after ``now``.
+        after ``now``. ``lasting``: it moves no robot, and is kept where the outbox is muted or forgets, as polls are.
         """
-        if self._muted and slot != KEEP_ALIVE:
+        lasting = lasting or slot == KEEP_ALIVE
+        if self._muted and not lasting:
             return
         old = self._slots.get(slot)
-        new = self._slots[slot] = _Group(frames, now, period_s, until, spacing_s)
+        new = self._slots[slot] = _Group(frames, now, period_s, until, spacing_s, lasting=lasting)
         if urgent:
             if not self._hurries(frames):
                 self._urgent.extend(frames)
             new.due = now + period_s
             if new.over:
                 del self._slots[slot]
-        elif old is not None and len(old.frames) == len(frames):
-            new.position = old.position
-            if old.frames == frames:  # it goes on
-                new.sent = old.sent
+        elif old is not None:
+            if len(old.frames) == len(frames):
+                new.position = old.position
+                new.sent = old.sent if old.frames == frames else 0
+            if old.due <= now or old.sent:  # it keeps its turn, and the spacing
+                new.due = old.due
 
     def prolong(self, slot: str, frames: tuple[bytes, ...], *, period_s: float, until: float) -> bool:
         """Repeat what ``slot`` holds until then, on its existing schedule; False if it holds other frames.
@@ -203,7 +213,7 @@ class Outbox(Kept):
         self._clear_slots()
 
     def _clear_slots(self) -> None:
-        self._slots = {slot: group for slot, group in self._slots.items() if slot == KEEP_ALIVE}
+        self._slots = {slot: group for slot, group in self._slots.items() if group.lasting}
 
     def clear(self, slot: str) -> None:
         """Empty ``slot``."""
@@ -275,14 +285,11 @@ class Outbox(Kept):
 
 
 def _write_slots(slots: dict[str, _Group]) -> list[Any]:
-    return [
-        [slot, FRAMES.write(group.frames), group.position, group.due, group.period_s, group.until, group.spacing_s]
-        for slot, group in slots.items()
-    ]
+    return [[slot, FRAMES.write(group.frames), *msgspec.structs.astuple(group)[1:]] for slot, group in slots.items()]
 
 
 def _read_slots(raw: list[Any]) -> dict[str, _Group]:
     slots = {}
-    for slot, frames, position, due, period_s, until, spacing_s in raw:
-        slots[slot] = _Group(FRAMES.read(frames), due, period_s, until, spacing_s, position, sent=position)
+    for slot, frames, *rest in raw:
+        slots[slot] = _Group(FRAMES.read(frames), *rest)
     return slots

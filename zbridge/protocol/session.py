@@ -246,7 +246,7 @@ class Session(Kept, ABC, Generic[M]):
             self.traffic.bytes_out += len(frame)
             if self.tap is not None:
                 self.tap("out", frame)
-        elif self.state is _CLOSING and not self.outbox:
+        elif self.state is _CLOSING and not self.outbox.waits(now):
             self._on(SessionEvent.WRITTEN)
         return frame
 
@@ -259,7 +259,7 @@ class Session(Kept, ABC, Generic[M]):
             return None
         outbox = self.outbox.deadline() if writing else None
         timers = math.inf if self.state is _CLOSING else self.timers()
-        if self._watches:
+        if self._watches and self.state is not _CLOSING:
             timers = min(timers, self.silence.due)
         earliest = min(self._limit_at, timers, math.inf if outbox is None else outbox)
         return None if earliest == math.inf else earliest

@@ -44,7 +44,7 @@ class Scene:
         self.written: list[bytes] = []
         """What the gateway's side wrote, frame by frame."""
         self._busy: str | None = None
-        self._needs_neutral = False
+        self._needs_neutral = self._leased = False
         self.answers = True
         """False: what the robot sends is lost, as by a cable that is cut in one direction."""
         self.connect()
@@ -58,6 +58,7 @@ class Scene:
             self.robot.driving.fail("closed by peer")
         self.session = self.robot.session(self.robot.link_names[0], PEER)
         self._greeted, self._busy = False, None
+        self._needs_neutral = self.now > 0.0
         self.session.open(self.now)
         self._hear(self.simulated.connected())
 
@@ -72,6 +73,7 @@ class Scene:
 
     def lease(self, on: bool) -> None:
         """Tell the robot side that a program has taken the lease, or that nobody has it any more."""
+        self._leased = on
         self.robot.leased(on, self.now)
 
     def restart(self) -> None:
@@ -89,6 +91,7 @@ class Scene:
             self.now += STEP_S
             self._hear(self.simulated.step(STEP_S))
             self.session.expire(self.now)
+            self._greet()
             self._follow_busy()
             while (frame := self.session.outgoing(self.now)) is not None:
                 self.session.outbox.written(self.now)
@@ -128,10 +131,16 @@ class Scene:
             with contextlib.suppress(ProtocolError):
                 stamp_ns = round(self.now * _NS_PER_S)
                 self.shown |= {topic.path: shown for topic, shown in self.robot.telemetry(message, stamp_ns)}
+        self._greet()
         self._follow_busy()
-        if self.session.state is State.ESTABLISHED and not self._greeted:
-            self._greeted = True
-            with contextlib.suppress(Refused):
-                self.stop()
-            self.robot.leased(False, self.now)
-            self.shown |= {topic.path: shown for topic, shown in self.robot.begun(round(self.now * _NS_PER_S))}
+
+    def _greet(self) -> None:
+        """Begin with a session that was just established, as a gateway does."""
+        if self.session.state is not State.ESTABLISHED or self._greeted:
+            return
+        self._greeted = True
+        with contextlib.suppress(Refused):
+            self.stop()
+        with contextlib.suppress(Refused):
+            self.robot.leased(self._leased, self.now)
+        self.shown |= {topic.path: shown for topic, shown in self.robot.begun(round(self.now * _NS_PER_S))}

@@ -115,6 +115,7 @@ class Conversation(Receiver):
         self._blocked = False
         """Whether nothing is written because the link is stalled."""
         self.reading = ReadControl(loop, clock, hooks.share)
+        self.reading.resumed = lambda: session.silence.restart(clock())
         self.heard_at = -math.inf
         """When anything came by the link last, or it came up."""
 
@@ -324,6 +325,8 @@ class Conversation(Receiver):
             self._before()
             self._reads_until = now + CATCH_UP_S
         elif now >= self._reads_until:
+            if self.reading.off:
+                self.session.silence.restart(now)
             self.session.expire(now)
 
     def _set_timer(self, deadline: float | None) -> None:

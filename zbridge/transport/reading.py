@@ -47,6 +47,8 @@ class ReadControl:
         self._share = share
         self._paused = False
         self._rests: asyncio.TimerHandle | None = None
+        self.resumed: Callable[[], object] = lambda: None
+        """Called when the link is read again."""
 
     def __repr__(self) -> str:
         return f"<ReadControl {'paused' if self._paused else 'rests' if self.rests else 'on'}>"
@@ -55,6 +57,11 @@ class ReadControl:
     def rests(self) -> bool:
         """Whether nothing is read because the share is used up."""
         return self._rests is not None
+
+    @property
+    def off(self) -> bool:
+        """Whether nothing is read now."""
+        return self._paused or self.rests
 
     def pause(self) -> None:
         """Read nothing until :meth:`resume`."""
@@ -92,3 +99,4 @@ class ReadControl:
     def _resume(self) -> None:
         if self.link is not None and self._rests is None and not self.suspended:
             self.link.resume_reading()
+            self.resumed()

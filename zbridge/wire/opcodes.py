@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any, ClassVar, Generic, TypeVar
 
-from zbridge.errors import ProtocolError
+from zbridge.errors import EncodeError, ProtocolError
 from zbridge.wire.binary import BinaryCodec
 from zbridge.wire.fields import Message, Scalar, declared_fields
 
@@ -29,7 +29,7 @@ class Opcodes(Generic[C]):
         self.messages = tuple(messages)
         self._codecs: dict[int, BinaryCodec[C]] = {kind.opcode: BinaryCodec(kind) for kind in self.messages}
         if len(self._codecs) != len(self.messages):
-            raise TypeError(f"{', '.join(kind.__name__ for kind in self.messages)}: an opcode stands twice")
+            raise TypeError(f"{', '.join(kind.__name__ for kind in self.messages)}: duplicate opcode")
         self._sizes: dict[int, int | None] = {kind.opcode: self._size(kind) for kind in self.messages}
 
     def __repr__(self) -> str:
@@ -53,7 +53,10 @@ class Opcodes(Generic[C]):
 
     def write(self, message: C) -> bytes:
         """Write one message; raise EncodeError for a value that its field cannot hold."""
-        return bytes((message.opcode,)) + self._codecs[message.opcode].encode(message)
+        codec = self._codecs.get(message.opcode)
+        if codec is None or codec.message is not type(message):
+            raise EncodeError(f"{message!r} is none of the messages")
+        return bytes((message.opcode,)) + codec.encode(message)
 
     def _size(self, kind: type[Any]) -> int | None:
         fixed = all(isinstance(field.wire, Scalar) and not field.optional for field in declared_fields(kind))

@@ -63,12 +63,11 @@ class Packets:
         whole = frame.startswith(self._head) and len(frame) >= self._least and self._size(frame, 0) == len(frame)
         if not whole:
             raise ProtocolError(f"no packet: {_shown(frame)}")
+        end = len(frame) - self._sum_bytes
         if not self._is_sound(frame):
-            expected = self._checksum(frame[: -self._sum_bytes])
-            raise ProtocolError(
-                f"checksum {frame[-self._sum_bytes :].hex()}, expected {expected.hex()}: {_shown(frame)}"
-            )
-        return frame[self._body_at : -self._sum_bytes]
+            expected = self._checksum(frame[:end])
+            raise ProtocolError(f"checksum {frame[end:].hex()}, expected {expected.hex()}: {_shown(frame)}")
+        return frame[self._body_at : end]
 
     def packet(self, body: bytes) -> bytes:
         """Write a body as a packet; raise EncodeError if it is too long."""
@@ -91,7 +90,8 @@ class Packets:
         return int(count) + self._uncounted
 
     def _is_sound(self, packet: bytes) -> bool:
-        return self._checksum(packet[: -self._sum_bytes]) == packet[-self._sum_bytes :]
+        end = len(packet) - self._sum_bytes
+        return self._checksum(packet[:end]) == packet[end:]
 
     def _noise_end(self, data: bytes, start: int) -> int:
         """Find the next place behind ``start`` where a packet may begin; long noise is cut into several frames."""

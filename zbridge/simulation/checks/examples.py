@@ -73,9 +73,9 @@ def _compare_shown(protocol: Protocol, message: Any, example: Example) -> list[s
     for name in robot.link_names:
         robot.session(name, PEER)
     codec = next(codec for codec in protocol.codecs if codec.name == example.codec)
-    for earlier in example.before:
-        list(robot.telemetry(codec.read(earlier), _STAMP_NS))
-    shown = dict(numbers(robot.telemetry(message, _STAMP_NS)))
+    for at_s, earlier in enumerate(example.before):
+        list(robot.telemetry(codec.read(earlier), _STAMP_NS + at_s * 10**9))
+    shown = dict(numbers(robot.telemetry(message, _STAMP_NS + len(example.before) * 10**9)))
     problems = []
     for name, expected in example.shown.items():
         if name not in shown:
@@ -95,7 +95,9 @@ def _commanded(protocol: Protocol, recording: Transcript, example: Example) -> s
     if outcome is None:
         return f"{brief(example.command)} is refused"
     return (
-        None if example.frame in written else f"{sorted(set(written))} is written, expected {example.frame!r} among it"
+        None
+        if rehearsal.session.undated(example.frame) in written
+        else f"{sorted(set(written))} is written, expected {example.frame!r} among it"
     )
 
 

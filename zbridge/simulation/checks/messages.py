@@ -168,7 +168,11 @@ def _damaged(codec: Codec, frames: list[bytes]) -> CheckFinding:
         if seal is not None and rng.random() < 0.5:  # too long, or too short
             damaged = damaged[: rng.randint(len(frame) // 2, len(frame))] + rng.randbytes(rng.choice((0, 3)))
         try:
-            codec.write(codec.read(damaged if seal is None else seal(damaged)))
+            damaged = damaged if seal is None else seal(damaged)
+        except EncodeError:  # too long
+            continue
+        try:
+            codec.write(codec.read(damaged))
             read += 1
         except EncodeError:
             read += 1

@@ -12,7 +12,7 @@ from zbridge.protocol.plugin import Protocol
 from zbridge.simulation.checks.finding import CheckFinding
 from zbridge.simulation.checks.handover import check_handover
 from zbridge.simulation.checks.stage import Stage
-from zbridge.simulation.checks.truth import NO_TRUTH, SCALE, SHOWN_SCALE, Leg, Way, full_scale, leg, unlike
+from zbridge.simulation.checks.truth import NO_TRUTH, SCALE, SHOWN_SCALE, Leg, Way, fractions, full_scale, leg, unlike
 
 DRIVE_S = 1.2
 IDLE_S = 0.3
@@ -20,7 +20,6 @@ STAND_S = 0.7
 """Seconds after a stop, or neutral, within which the robot must halt."""
 WATCHED_S = 0.8
 TURN_S = 0.8
-FORWARD, TURN = 0.4, 1.0
 FACTOR = 3.0
 """Tolerance of what is shown against the options, where the truth is not known."""
 TURNED_RAD, MOVED_M = 0.02, 0.02
@@ -38,24 +37,25 @@ SHOWN = "what is shown of its way is true"
 
 async def check_motion(protocol: Protocol, stage: Stage) -> list[CheckFinding]:
     """Drive the simulated robot forward and to the left, and stop it in each of the ways there are."""
+    forward, left = fractions(protocol, DRIVE_S, TURN_S)
     stage.prepare()
     await stage.watch(IDLE_S)
     idle = stage.written
-    ahead = await leg(stage, DRIVE_S, STAND_S, stop=False, forward=FORWARD)
-    findings = [_drives(ahead, idle, protocol), _speed(ahead, protocol), await _stands(stage, NEUTRAL)]
-    turn = await leg(stage, TURN_S, STAND_S, turn=TURN)
+    ahead = await leg(stage, DRIVE_S, STAND_S, stop=False, forward=forward)
+    findings = [_drives(ahead, idle), _speed(ahead, protocol, forward), await _stands(stage, NEUTRAL)]
+    turn = await leg(stage, TURN_S, STAND_S, turn=left)
     findings.append(await _stands(stage, STANDS))
-    after = await leg(stage, DRIVE_S, STAND_S, forward=FORWARD)
-    curve = await leg(stage, TURN_S, STAND_S, forward=FORWARD, turn=TURN)
+    after = await leg(stage, DRIVE_S, STAND_S, forward=forward)
+    curve = await leg(stage, TURN_S, STAND_S, forward=forward, turn=left)
     findings.append(await _stands(stage, WHOLE))
-    findings += [_turns(turn, curve, protocol), _rate(turn, protocol), _ahead(after)]
+    findings += [_turns(turn, curve, protocol), _rate(turn, protocol, left), _ahead(after)]
     findings.append(_shown((ahead, turn, after, curve), protocol))
     return [*findings, check_handover(protocol, stage.received)]
 
 
-def _drives(ahead: Leg, idle: set[bytes], protocol: Protocol) -> CheckFinding:
+def _drives(ahead: Leg, idle: set[bytes]) -> CheckFinding:
     if ahead.refused:
-        return CheckFinding(DRIVES, f"Drive(forward={FORWARD}) is refused: {ahead.refused}", guide=_UNITS)
+        return CheckFinding(DRIVES, f"a drive ahead is refused: {ahead.refused}", guide=_UNITS)
     if ahead.true is not None and ahead.true.ahead_m < MOVED_M:
         return CheckFinding(DRIVES, f"it truly moved {ahead.true.ahead_m:.3f} m ahead in {DRIVE_S:g} s", guide=_UNITS)
     if ahead.shown is None and not ahead.speeds:
@@ -69,15 +69,15 @@ def _drives(ahead: Leg, idle: set[bytes], protocol: Protocol) -> CheckFinding:
     return CheckFinding(DRIVES, None, f"{ahead.shown.ahead_m:.2f} m" if ahead.shown else "by its speed")
 
 
-def _speed(ahead: Leg, protocol: Protocol) -> CheckFinding:
-    expected = full_scale(protocol, "speed_full_m_s", "speed_full_mps") * FORWARD
+def _speed(ahead: Leg, protocol: Protocol, forward: float) -> CheckFinding:
+    expected = full_scale(protocol, "speed_full_m_s", "speed_full_mps") * forward
     return _as_fast(SPEED, expected, "m/s", ahead, ahead.steady_m_s, ahead.shown and ahead.shown.ahead_m)
 
 
-def _rate(turn: Leg, protocol: Protocol) -> CheckFinding:
+def _rate(turn: Leg, protocol: Protocol, left: float) -> CheckFinding:
     if turn.refused:
-        return CheckFinding.not_checked(RATE, f"Drive(turn={TURN}) is refused: {turn.refused}", _UNITS)
-    expected = full_scale(protocol, "turn_full_rad_s", "turn_full_radps") * TURN
+        return CheckFinding.not_checked(RATE, f"a turn on the spot is refused: {turn.refused}", _UNITS)
+    expected = full_scale(protocol, "turn_full_rad_s", "turn_full_radps") * left
     return _as_fast(RATE, expected, "rad/s", turn, turn.steady_rad_s, turn.shown and turn.shown.turned_rad)
 
 
@@ -114,13 +114,12 @@ async def _stands(stage: Stage, claim: str) -> CheckFinding:
 
 
 def _turns(turn: Leg, curve: Leg, protocol: Protocol) -> CheckFinding:
-    """Judge the turn on the spot; where the options state no turn rate, as of a car, a curve ahead."""
-    on_spot = bool(full_scale(protocol, "turn_full_rad_s", "turn_full_radps")) or (
-        turn.true is not None and abs(turn.true.turned_rad) > TURNED_RAD
-    )
-    judged = turn if on_spot or curve.true is None else curve
+    """Judge the turn on the spot; of a robot that steers, a curve ahead."""
+    turned = [abs(way.turned_rad) for way in (turn.true, turn.shown) if way is not None]
+    stated = bool(full_scale(protocol, "turn_full_rad_s", "turn_full_radps"))
+    judged = turn if not turn.refused and (stated or any(rad > TURNED_RAD for rad in turned)) else curve
     if judged.refused:
-        return CheckFinding(TURNS, None, judged.refused)
+        return CheckFinding.not_checked(TURNS, f"turns are refused: {judged.refused}", _UNITS)
     if judged.true is None and judged.shown is None:
         return CheckFinding.not_checked(TURNS, f"it shows no pose, and {NO_TRUTH}", _UNITS)
     for what, way in (("truly", judged.true), ("as it shows", judged.shown)):

@@ -24,6 +24,8 @@ STEP_S = 0.01
 """Virtual seconds between two frames of a rehearsal."""
 AGAIN_S = 0.1
 """Virtual seconds between two frames of a robot that sends by itself."""
+BEGUN_NS = 10**18
+"""The time at which a rehearsal begins, as stamps show it."""
 PEER = "tcp://robot.test:1"
 MORE_FRAMES = 20
 """Frames of the robot after the handshake."""
@@ -178,7 +180,7 @@ class Rehearsal:
         self._heard_at = self.now
         for message in self.session.receive(frame, self.now):
             with contextlib.suppress(ProtocolError):
-                self.shown += self.robot.telemetry(message, 1)
+                self.shown += self.robot.telemetry(message, BEGUN_NS + round(self.now * 1e9))
         if self.session.state is State.ESTABLISHED and not self._begun:
             self._begun = True
             self.robot.begun(1)

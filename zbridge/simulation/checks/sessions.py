@@ -19,7 +19,7 @@ STEPS = 12
 """Steps of a long handshake at which something goes wrong."""
 SEEDS = 4
 GARBAGE_BYTES = 80
-STAMP_NS, STAMP_WITHIN_NS = 10**18, 10**10
+STAMP_NS, APART_NS, STAMP_WITHIN_NS = 10**18, 10**8, 10**10
 """When the robot's messages arrive, and the tolerance of their stamps: a robot may have its own clock."""
 
 
@@ -34,8 +34,11 @@ def check_sessions(protocol: Protocol, recording: Transcript) -> Iterator[CheckF
     yield CheckFinding(ESTABLISHED, recording.reason, guide=_GUIDE)
     if not recording.established:
         return
-    claim = f"{len(recording.messages)} messages of the robot are translated"
-    yield CheckFinding.of(claim, _translated(protocol, recording), guide="5. Telemetry")
+    claim, guide = f"{len(recording.messages)} messages of the robot are translated", "5. Telemetry"
+    if recording.messages or Rehearsal(protocol, recording).session.silent_s != math.inf:
+        yield CheckFinding.of(claim, _translated(protocol, recording), guide=guide)
+    else:
+        yield CheckFinding.not_checked(claim, "the simulated robot sent none, which it may", guide)
     count = recording.unanswered
     if count is not None:
         without = f"{count} had no answer in time: see expects, answers and frame_end" if count else None
@@ -62,6 +65,8 @@ def _falls_silent(claim: str, protocol: Protocol, recording: Transcript) -> Chec
     rehearsal = Rehearsal.established(protocol, recording)
     session, begun = rehearsal.session, rehearsal.now
     kind = type(session).__qualname__
+    if session.busy is not None:
+        return CheckFinding.not_checked(claim, f"{kind} is busy from the start: {session.busy}")
     while rehearsal.now < begun + SILENT_S and not session.over and session.busy is None:
         rehearsal.run(_TICK_S, answers=False)
     if session.over or session.busy is not None:
@@ -158,7 +163,8 @@ def _translated(protocol: Protocol, recording: Transcript) -> list[str]:
         robot.session(name, PEER)
     if not recording.messages:
         problems.append("the simulated robot sent none")
-    for stamp_ns, message in enumerate(recording.messages, STAMP_NS):
+    for number, message in enumerate(recording.messages):
+        stamp_ns = STAMP_NS + number * APART_NS
         try:
             for topic, shown in robot.telemetry(message, stamp_ns):
                 payloads.decode(topic.message, payloads.encode(shown))

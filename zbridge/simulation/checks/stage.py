@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import time
 from collections.abc import AsyncIterator, Iterator
 from functools import partial
 from typing import Any
@@ -88,7 +89,7 @@ class Stage:
         self.messages += messages
         for message in messages:
             with contextlib.suppress(ProtocolError):
-                shown = tuple(self.robot.telemetry(message, 1))
+                shown = tuple(self.robot.telemetry(message, time.time_ns()))
                 self.shown += shown
                 self.history += shown
 
@@ -193,6 +194,11 @@ class Stage:
         return self.of(Pose)
 
     @property
+    def last_pose(self) -> Pose | None:
+        """The newest pose of all: a robot may show it only when it changes."""
+        return next((shown for _, shown in reversed(self.history) if isinstance(shown, Pose)), None)
+
+    @property
     def speeds(self) -> list[float]:
         return [motion.speed for motion in self.of(Motion) if motion.speed is not None]
 
@@ -286,14 +292,28 @@ async def record(protocol: Protocol, establish_s: float) -> Transcript:
         handshake = len(stage.frames)
         if established:
             await stage.watch(SHOWN_S)
+        received = [frame for direction, frame in stage.frames if direction == "in"][:_MOST_FRAMES]
+        messages = list(stage.messages)
+        if established:
+            await _command(stage)
         return Transcript(
-            [frame for direction, frame in stage.frames if direction == "in"][:_MOST_FRAMES],
+            received,
             _answers(stage.frames[handshake:]),
-            list(stage.messages),
+            messages,
             established,
             None if established else "; ".join(stage.lacking(establish_s)),
             _unanswered(stage),
         )
+
+
+async def _command(stage: Stage) -> None:
+    """Let the robot answer drives and a stop, for rehearsals."""
+    stage.prepare()
+    for forward, turn in ((0.5, 0.0), (0.0, 0.5), (0.0, -0.5), (-0.5, 0.0), (0.5, 0.5)):
+        with contextlib.suppress(Refused):
+            await stage.drive(AGAIN_S, forward, turn)
+    with contextlib.suppress(Refused):
+        await stage.stop(2 * AGAIN_S)
 
 
 def _unanswered(stage: Stage) -> int | None:

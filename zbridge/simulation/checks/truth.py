@@ -10,17 +10,21 @@ import msgspec
 
 from zbridge.errors import Refused
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Drive, Pose
+from zbridge.fleet.messages import Drive
 from zbridge.protocol import plugin
 from zbridge.protocol.plugin import Truth
 from zbridge.simulation.checks.stage import Stage
 
 STEADY_S = 0.4
-"""Seconds at the end of a drive in which the speed no longer changes."""
+"""Seconds over which a speed is taken."""
 SCALE = 0.15
 """Tolerance of a true speed against the options: robots count in whole units."""
 SHOWN_SCALE = 0.1
 """Tolerance of what is shown against the truth."""
+FORWARD = 0.4
+"""A drive ahead, if the robot is not too fast for the room."""
+MOST_M, LEAST_M, MOST_RAD = 0.4, 0.04, 2.0
+"""Bounds of one leg."""
 NO_TRUTH = "the simulated robot reports no truth (Simulation.report)"
 
 
@@ -54,7 +58,7 @@ class Way(NamedTuple):
 class Leg(msgspec.Struct, frozen=True, kw_only=True):
     """A drive, and how it ended. shown: None where no pose is shown. true: None where the simulator does not say.
 
-    steady_m_s, steady_rad_s: the true speed and turn rate at the end of the drive. wheels_m_s: as of :class:`Truth`,
+    steady_m_s, steady_rad_s: the true speed and turn rate during the drive. wheels_m_s: as of :class:`Truth`,
     then. speeds: what ``motion`` showed at the end of the drive. refused: why, if the drive was refused.
     """
 
@@ -73,7 +77,7 @@ async def leg(
     stage: Stage, seconds: float, stand_s: float, *, forward: float = 0.0, turn: float = 0.0, stop: bool = True
 ) -> Leg:
     """Drive for so long, end with a stop or with neutral, and wait until the robot stands."""
-    pose, truth, begun = _last(stage.poses), stage.truth, stage.now()
+    pose, truth, begun = stage.last_pose, stage.truth, stage.now()
     stage.forget()
     refused = None
     try:
@@ -81,14 +85,14 @@ async def leg(
     except Refused as refusal:
         refused = f"{refusal.code}: {refusal}"
     ended, speeds, written = stage.now(), tuple(stage.speeds[-3:]), frozenset(stage.written)
-    steady = [entry for entry in stage.truths if ended - STEADY_S <= entry[0] <= ended]
+    steady = [entry for entry in stage.truths if begun <= entry[0] <= ended]
     if stop:
         await stage.stop(stand_s)
     else:
         stage.robot.command(topics.CMD_DRIVE, Drive(), stage.now())
         await stage.watch(stand_s)
     steady_m_s, steady_rad_s = _rates(steady)
-    after, true = _last(stage.poses), stage.truth
+    after, true = stage.last_pose, stage.truth
     return Leg(
         seconds=ended - begun,
         shown=Way.between(pose, after) if pose is not None and after is not None else None,
@@ -102,16 +106,21 @@ async def leg(
     )
 
 
-def _last(poses: Sequence[Pose]) -> Pose | None:
-    return poses[-1] if poses else None
-
-
 def _rates(truths: Sequence[tuple[float, Truth]]) -> tuple[float, float]:
-    """Return the mean speed ahead, m/s, and the mean turn rate, rad/s."""
-    if len(truths) < 2 or truths[-1][0] <= truths[0][0]:
-        return 0.0, 0.0
-    seconds, way = truths[-1][0] - truths[0][0], Way.between(truths[0][1], truths[-1][1])
-    return math.copysign(way.far_m, way.ahead_m) / seconds, way.turned_rad / seconds
+    """Return the greatest mean speed ahead, m/s, and the greatest mean turn rate, rad/s, over :data:`STEADY_S`.
+
+    The greatest: on a busy machine a drive may come late, and a robot that misses it stops meanwhile.
+    """
+    speeds, rates, first = [0.0], [0.0], 0
+    for at, truth in truths:
+        while truths[first][0] < at - STEADY_S:
+            first += 1
+        seconds = at - truths[first][0]
+        if seconds >= STEADY_S / 2:
+            way = Way.between(truths[first][1], truth)
+            speeds.append(math.copysign(way.far_m, way.ahead_m) / seconds)
+            rates.append(way.turned_rad / seconds)
+    return max(speeds, key=abs), max(rates, key=abs)
 
 
 def full_scale(protocol: plugin.Protocol, *names: str) -> float:
@@ -120,6 +129,16 @@ def full_scale(protocol: plugin.Protocol, *names: str) -> float:
     tables = [options, *(getattr(options, name) for name in options.__struct_fields__)]
     found = (getattr(table, name, None) for table in tables if isinstance(table, msgspec.Struct) for name in names)
     return next((value for value in found if isinstance(value, float)), 0.0)
+
+
+def fractions(protocol: plugin.Protocol, drive_s: float, turn_s: float) -> tuple[float, float]:
+    """Return a drive ahead and a turn, fractions of full scale, that stay within the room and half a turn."""
+    m_s = full_scale(protocol, "speed_full_m_s", "speed_full_mps")
+    rad_s = full_scale(protocol, "turn_full_rad_s", "turn_full_radps")
+    forward = min(FORWARD, MOST_M / (m_s * drive_s)) if m_s else FORWARD
+    if m_s and m_s * drive_s * forward < LEAST_M:
+        forward = 1.0
+    return forward, min(1.0, MOST_RAD / (rad_s * turn_s)) if rad_s else 1.0
 
 
 def unlike(seen: float, expected: float, within: float) -> bool:

@@ -254,7 +254,7 @@ class Enforcer:
                 if event.what in (EventKind.LATCHED, EventKind.UNLATCHED):
                     self._save_latches()
                 self._audit.write(event)
-            self.lease_hook.tell()
+            self.lease_hook.notify()
             if self._control_due is None and not self._closed:
                 self._control_due = self._loop.call_later(_CONTROL_S, self.report)
         if changed:

@@ -1,4 +1,4 @@
-"""How each side of a session knows that the other one lives: what we repeat, and how long nothing came. Sans-IO.
+"""Keep-alives and silence detection of a session. Sans-IO.
 
 Theory of operation. A watch begins when a session is established, at the next timer. Every message that could be read
 is a sign of life; noise is none. After ``silent_s`` without one the robot is not driven, after ``lost_s`` the session

@@ -29,11 +29,11 @@ class HqSimulation(msgspec.Struct, frozen=True):
 
 
 class Truth(msgspec.Struct, frozen=True):
-    """How a simulated robot really is, whatever it says: the conformance kit compares what is shown with it.
+    """Ground truth of a simulated robot: the conformance kit compares what is shown with it.
 
     x, y, heading: metres and radians in the room, counter-clockwise (REP 103). wheels_m_s: the speed of each side over
     ground, left first; empty: it has no such sides. neutral: whether its motors are told to stand still.
-    wraps: how often one of its counters has begun anew. watchdog: whether its watchdog has stopped it, because a
+    wraps: how often one of its counters has wrapped around. watchdog: whether its watchdog has stopped it, because a
     keep-alive or a request was missing.
     """
 
@@ -49,10 +49,10 @@ class Truth(msgspec.Struct, frozen=True):
 class Simulation(msgspec.Struct, frozen=True):
     """The start options of a simulated robot. ``addresses``: where it listens, one for each link, in the links' order.
 
-    ``ready`` is called with the bound addresses. A protocol raises ConfigError for what it does not support (versions,
-    dialects, datagrams, a second link). For the conformance kit: ``place`` is where the robot begins (x, y, heading;
-    None: where it likes), ``at_wrap`` lets its counters begin just below the value after which they begin anew, and
-    ``report`` is called with the truth after each step.
+    ``ready`` is called with the bound addresses. A protocol raises ConfigError for what it does not support
+    (versions, dialects, datagrams, a second link). For the conformance kit: ``place`` is where the robot begins (x,
+    y, heading; None: a place of its choice), ``at_wrap`` lets its counters begin just below the value at which they
+    wrap around, and ``report`` is called with the truth after each step.
     """
 
     addresses: tuple[Address, ...]

@@ -353,7 +353,7 @@ class RobotDevice(Transferable):
                 session.outbox.forget()
                 with contextlib.suppress(Refused):
                     self._standstill.stop()
-                self.enforcer.lease_hook.tell(anew=True)
+                self.enforcer.lease_hook.notify(anew=True)
 
     async def resume(self) -> None:
         """Read, write and take commands: again, or for the first time with what was taken over."""

@@ -138,6 +138,6 @@ class Presence:
         self._greeted = session
         with contextlib.suppress(Refused):  # the condition says so on status
             self._standstill.stop()
-        self._enforcer.lease_hook.tell(anew=True)
+        self._enforcer.lease_hook.notify(anew=True)
         for topic, message in self._context.robot.begun(self._context.clock_ns()):
             self._context.publish(topic, message)

@@ -8,7 +8,7 @@ Theory of operation. A stream that was damaged is searched for the next packet, 
 are noise: they are cut into frames of their own, for which :meth:`Packets.body` raises ProtocolError, so they are
 counted and dropped. What looks like a packet and has a wrong checksum is noise up to the next head *behind its own*,
 not up to the end that its count claims: a wrong count, or a head within a body, costs no packet but its own. A wrong
-count can delay the packets behind it until as many bytes have come, ``most`` at most; they are not lost.
+count delays the following packets by at most ``most`` bytes; it does not lose them.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Packets:
 
     head: the bytes that begin each packet. count: the :mod:`struct` code of the field that follows the head, with its
     byte order (``"B"``, ``"<H"``). uncounted: bytes of a packet that the count leaves out. checksum: computes the bytes
-    at the end from all bytes before them; it must bear any packet. most: bytes of the longest packet.
+    at the end from all bytes before them; it must accept any bytes. most: bytes of the longest packet.
 
     ARCOS: ``Packets(b"\xfa\xfb", "B", uncounted=3, checksum=arcos_checksum, most=208)``.
     """
@@ -59,7 +59,7 @@ class Packets:
         return end if end > len(data) or self._is_sound(data[start:end]) else self._noise_end(data, start)
 
     def body(self, frame: bytes) -> bytes:
-        """Return what stands between count and checksum; raise ProtocolError for noise and for a wrong checksum."""
+        """Return the body of a packet; raise ProtocolError for noise and for a wrong checksum."""
         whole = frame.startswith(self._head) and len(frame) >= self._least and self._size(frame, 0) == len(frame)
         if not whole:
             raise ProtocolError(f"no packet: {_shown(frame)}")
@@ -82,7 +82,7 @@ class Packets:
         return begun + self._checksum(begun)
 
     def seal(self, frame: bytes) -> bytes:
-        """Make a damaged packet whole: its head, count and checksum fit its body again. For fuzzing."""
+        """Recompute head, count and checksum of a damaged packet, for fuzzing."""
         return self.packet(frame[self._body_at : len(frame) - self._sum_bytes])
 
     def _size(self, data: bytes, start: int) -> int:

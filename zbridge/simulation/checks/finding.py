@@ -14,7 +14,7 @@ _SHOWN = 3
 
 
 class SimulatorFault(Exception):
-    """The simulated robot raised an exception, or ended; the text says all."""
+    """The simulated robot raised an exception, or ended; the text is complete."""
 
 
 class CheckFinding(msgspec.Struct, frozen=True):

@@ -1,4 +1,4 @@
-"""Conformance of a handover: another process that takes a connection over goes on as the one before would have."""
+"""Conformance of a handover: another process that takes a connection over continues as the one before would."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from zbridge.simulation.checks.examples import numbers
 from zbridge.simulation.checks.finding import CheckFinding
 from zbridge.simulation.checks.rehearsal import Rehearsal, Transcript, named, robot_of
 
-CLAIM = "another process that takes the connection over goes on as this one would"
+CLAIM = "another process that takes the connection over continues as this one would"
 GUIDE = "4. A robot that sends by itself: Restarts"
 AFTER_S = 1.0
 

@@ -150,7 +150,7 @@ async def check_wrap(protocol: Protocol, stage: Stage) -> list[CheckFinding]:
     forward, _ = fractions(protocol, WRAP_S, WRAP_S)
     driven = await leg(stage, WRAP_S, STAND_S, forward=forward)
     if stage.truth.wraps == wraps:
-        why = f"no counter began anew within {WRAP_S:g} s (Simulation.at_wrap, Truth.wraps)"
+        why = f"no counter wrapped around within {WRAP_S:g} s (Simulation.at_wrap, Truth.wraps)"
         return [CheckFinding.not_checked(WRAPS, why, _ODOMETRY)]
     assert driven.true is not None
     off = None

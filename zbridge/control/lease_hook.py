@@ -26,7 +26,7 @@ class LeaseHook:
         self._notified = None
 
     def notify(self, *, anew: bool = False) -> None:
-        """Notify whether somebody has the lease, if that has changed, or ``anew``; not before the session is established."""
+        """Notify whether somebody has the lease, if that changed or ``anew``; not before the session is established."""
         self._notify(self._authority.holders.current is not None and not self._left, anew=anew)
 
     def repeat(self) -> None:

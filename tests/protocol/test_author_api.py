@@ -9,6 +9,7 @@ import importlib
 import inspect
 import json
 import sys
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,7 @@ def _lines(name: str, value: Any) -> list[str]:
     lines = [name]
     if inspect.isclass(value):
         lines += [f"{name}.{member}" for member in dir(value) if not member.startswith("_")]
-        lines += [f"{name}({argument})" for argument in _arguments(value)]
+        lines += [f"{name}({argument})" for argument in _arguments(value) if not issubclass(value, Enum)]
     elif inspect.isfunction(value):
         lines += [f"{name}({argument})" for argument in _arguments(value)]
     return lines

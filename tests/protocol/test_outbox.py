@@ -291,3 +291,18 @@ def test_another_process_sends_the_rest_of_a_group_that_replaced_one_halfway() -
     heir.restore(outbox.export())
     for each in (outbox, heir):
         play(each, "from 0.1 to 1 = 0.1:d 0.2:c; due never")
+
+
+def test_the_slots_of_a_gateway_of_0_2_are_taken_over() -> None:
+    """A group of two, of which one had left: slot, frames, position, due, period, until, spacing."""
+    heir = Outbox(0.0)
+    heir.restore(heir.export() | {"_slots": [["motion", [["", b"none"], ["", b"stop"]], 1, 5.0, 0.25, 5.4, 0.0]]})
+    play(heir, "from 5 to 9 = 5:stop 5.25:none 5.25:stop")
+
+
+def test_a_state_keeps_what_a_poll_is() -> None:
+    outbox, heir = Outbox(0.0), Outbox(0.0)
+    outbox.set("poll", (b"p",), 0.0, period_s=1.0, lasting=True)
+    heir.restore(outbox.export())
+    heir.forget()
+    play(heir, "take 0 = p; due 1")

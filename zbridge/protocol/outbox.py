@@ -134,7 +134,7 @@ class Outbox(Kept):
         self._quiet_until = until
 
     def mute(self, muted: bool) -> None:
-        """Drop all frames but exempt ones and the keep-alive, waiting or new, until ``mute(False)``."""
+        """Drop all frames but exempt ones, polls and the keep-alive, waiting or new, until ``mute(False)``."""
         self._muted = muted
         if muted:
             for place in (self._queue, self._urgent):
@@ -285,11 +285,18 @@ class Outbox(Kept):
 
 
 def _write_slots(slots: dict[str, _Group]) -> list[Any]:
-    return [[slot, FRAMES.write(group.frames), *msgspec.structs.astuple(group)[1:]] for slot, group in slots.items()]
+    """Write the groups; what 0.2 did not know stands last."""
+    return [
+        [slot, FRAMES.write(group.frames), group.position, group.due, group.period_s, group.until, group.spacing_s]
+        + [group.sent, group.lasting]
+        for slot, group in slots.items()
+    ]
 
 
 def _read_slots(raw: list[Any]) -> dict[str, _Group]:
+    """Read the groups, also as 0.2 wrote them."""
     slots = {}
-    for slot, frames, *rest in raw:
-        slots[slot] = _Group(FRAMES.read(frames), *rest)
+    for slot, frames, position, due, period_s, until, spacing_s, *more in raw:
+        sent, lasting = more or (position, False)
+        slots[slot] = _Group(FRAMES.read(frames), due, period_s, until, spacing_s, position, sent, lasting)
     return slots

@@ -17,6 +17,7 @@ from zbridge.protocol.session import Session, State
 from zbridge.simulation.simulated import STEP_S, SimulatedRobot
 
 PEER = "tcp://robot.test:1"
+"""The address that sessions of a scene or a rehearsal are given."""
 STOPPED_S = 1.0
 """Seconds for which the gateway repeats a stop."""
 _NS_PER_S = 1_000_000_000

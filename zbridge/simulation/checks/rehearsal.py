@@ -19,6 +19,7 @@ from zbridge.metrics import Metrics
 from zbridge.protocol.exchange import ExchangeSession
 from zbridge.protocol.plugin import Outcome, Protocol, RobotSide, Telemetry
 from zbridge.protocol.session import Session, State
+from zbridge.simulation.scene import PEER as PEER
 
 STEP_S = 0.01
 """Virtual seconds between two frames of a rehearsal."""
@@ -26,7 +27,6 @@ AGAIN_S = 0.1
 """Virtual seconds between two frames of a robot that sends by itself."""
 BEGUN_NS = 10**18
 """The time at which a rehearsal begins, as stamps show it."""
-PEER = "tcp://robot.test:1"
 MORE_FRAMES = 20
 """Frames of the robot after the handshake."""
 _MOST_WRITES = 10_000

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -26,14 +26,6 @@ FORWARD = 0.4
 MOST_M, LEAST_M, MOST_RAD = 0.4, 0.04, 2.0
 """Bounds of one leg."""
 NO_TRUTH = "the simulated robot reports no truth (Simulation.report)"
-
-
-class Placed(Protocol):
-    """A pose, shown or true."""
-
-    x: float
-    y: float
-    heading: float
 
 
 class Way(NamedTuple):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from statistics import median
 from typing import Any, NamedTuple
 
 import msgspec
@@ -99,11 +100,10 @@ async def leg(
 
 
 def _rates(truths: Sequence[tuple[float, Truth]]) -> tuple[float, float]:
-    """Return the greatest mean speed ahead, m/s, and the greatest mean turn rate, rad/s, over :data:`STEADY_S`.
-
-    The greatest: on a busy machine a drive may come late, and a robot that misses it stops meanwhile.
-    """
-    speeds, rates, first = [0.0], [0.0], 0
+    """Return the usual speed ahead, m/s, and the usual turn rate, rad/s, over :data:`STEADY_S`."""
+    speeds: list[float] = []
+    rates: list[float] = []
+    first = 0
     for at, truth in truths:
         while truths[first][0] < at - STEADY_S:
             first += 1
@@ -112,7 +112,16 @@ def _rates(truths: Sequence[tuple[float, Truth]]) -> tuple[float, float]:
             way = Way.between(truths[first][1], truth)
             speeds.append(math.copysign(way.far_m, way.ahead_m) / seconds)
             rates.append(way.turned_rad / seconds)
-    return max(speeds, key=abs), max(rates, key=abs)
+    return _usual(speeds), _usual(rates)
+
+
+def _usual(values: list[float]) -> float:
+    """Return the median of the values that are no less than half the greatest.
+
+    On a busy machine a drive may come late, and the robot stops meanwhile; a simulator that was late catches up.
+    """
+    most = max(map(abs, values), default=0.0)
+    return median(value for value in values if abs(value) >= most / 2) if values else 0.0
 
 
 def full_scale(protocol: plugin.Protocol, *names: str) -> float:

@@ -43,8 +43,8 @@ ok "the gateways' health check"
 
 metrics=http://127.0.0.1:9100
 within 10 answers $metrics/readyz 200 || fail "/readyz"
-within 10 answers $metrics/metrics 'zbridge_published_total{key="pose"} [1-9]' || fail "/metrics"
-counted=$(page $metrics/metrics | grep '^zbridge_published_total')
+within 10 answers $metrics/metrics 'zbridge_bus_messages_total{direction="out",kind="pose",.*} [1-9]' || fail "/metrics"
+counted=$(page $metrics/metrics | grep '^zbridge_bus_messages_total')
 code=0
 zbridge health --tls wall >health.log || code=$?
 [ $code -eq 0 ] || { cat health.log; fail "zbridge health"; }

@@ -19,8 +19,8 @@ health() { zbridge health --tls wall >health.log; }
 within 20 health || { cat health.log; fail "zbridge health"; }
 within 10 answers http://127.0.0.1:9101/readyz 200 || fail "/readyz of r1"
 within 10 answers http://127.0.0.1:9101/healthz 200 || fail "/healthz of r1"
-within 10 answers http://127.0.0.1:9101/metrics 'zbridge_published_total{key="pose"} [1-9]' || fail "/metrics of r1"
-ok "zbridge health: $(cat health.log); /readyz, /healthz; /metrics: $(page http://127.0.0.1:9101/metrics | grep '^zbridge_published_total')"
+within 10 answers http://127.0.0.1:9101/metrics 'zbridge_bus_messages_total{direction="out",kind="pose",.*} [1-9]' || fail "/metrics of r1"
+ok "zbridge health: $(cat health.log); /readyz, /healthz; /metrics: $(page http://127.0.0.1:9101/metrics | grep '^zbridge_bus_messages_total')"
 
 end_of r2
 

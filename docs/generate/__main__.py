@@ -6,7 +6,7 @@ import re
 import sys
 from pathlib import Path
 
-from docs.generate import bus, command_line, configuration
+from docs.generate import bus, command_line, configuration, metrics
 
 DOCS = Path(__file__).parents[1]
 PART = re.compile(r"(<!-- generated: ([^>]+) -->\n).*?(<!-- /generated -->)", re.DOTALL)
@@ -14,7 +14,7 @@ PART = re.compile(r"(<!-- generated: ([^>]+) -->\n).*?(<!-- /generated -->)", re
 
 def generated() -> dict[str, str]:
     """Return every generated part by its name."""
-    return {**bus.sections(), **configuration.sections(), **command_line.sections()}
+    return {**bus.sections(), **configuration.sections(), **command_line.sections(), **metrics.sections()}
 
 
 def rewritten(page: str, parts: dict[str, str]) -> str:

@@ -94,8 +94,8 @@ class AlfRobot(RobotSide):
         self._scanner: messages.ScannerInit | None = None
         self._clock = DeviceClock(_COUNTER_ENDS if self._dialect is messages.AlfDialect.BINARY else None)
         self._sequence: int | None = None
-        self._gaps = metrics.count("sequence_gaps")
-        self._duplicates = metrics.count("sequence_duplicates")
+        self._gaps = metrics.count("sequence_gaps", help="Sequence numbers of ALF that are missing.")
+        self._duplicates = metrics.count("sequence_duplicates", help="Sequence numbers of ALF that came twice.")
         self._light = False
         self._backward = False
         self._command = self._neutral()

@@ -73,9 +73,9 @@ class RosRobot(RobotSide):
         self._known: dict[str, FleetMessage] = {}
         self._speed: float | None = None
         self._has_imu = False
-        self._ahead = metrics.count("stamps_ahead")
-        self._astray = metrics.count("stamps_astray")
-        self._overruled = metrics.count("commands_overruled")
+        self._ahead = metrics.count("stamps_ahead", help="Time stamps after their arrival; the arrival is used.")
+        self._astray = metrics.count("stamps_astray", help="Time stamps that are too old; the arrival is used.")
+        self._overruled = metrics.count("commands_overruled", help="Commands of other nodes that were overruled.")
 
     def session(self, link: str, peer: str) -> RosRole:
         self.driving = RosRole(self.options, self._types, self._overruled)

@@ -44,7 +44,9 @@ class Wc2EcHq(HqSide):
         self._draft = self._dialect is Wc2EcDialect.DRAFT
         self.follows = ("scan",) if self._draft else ("scan", "scanner", "devices", "sensor/*")
         self._sessions: list[Wc2EcClient] = []
-        left_out = (metrics or Metrics()).count("hq_devices_left_out")
+        left_out = (metrics or Metrics()).count(
+            "hq_devices_left_out", help="Devices that a WC2EC controller could not be shown."
+        )
         self._table = DeviceTable(options, view, self._registered, left_out)
         self._frames: dict[int, tuple[float, bytes]] = {}
         """The value that was encoded last of each device."""

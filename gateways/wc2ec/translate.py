@@ -68,8 +68,10 @@ class Wc2EcRobot(RobotSide):
         self._subscribed: set[str] = set(options.pinned)
         self._ring: BearingScan | None = None
         self._tables = {name: _interpolation(table) for name, table in options.tables.items()}
-        self._faults = metrics.count("sensor_faults")
-        self._unregistered = metrics.count("sensor_unregistered")
+        self._faults = metrics.count("sensor_faults", help="Implausible readings of WC2EC sensors.")
+        self._unregistered = metrics.count(
+            "sensor_unregistered", help="Readings of WC2EC devices that were not registered."
+        )
         self._motor_types = {ROTATIONAL: options.motor_types.rotational, LINEAR: options.motor_types.linear}
         self._motor_names = {ROTATIONAL: options.motors.rotational, LINEAR: options.motors.linear}
 

@@ -44,12 +44,12 @@ def test_rates_are_what_was_published_since_the_reading_before_by_the_first_part
     metrics, clock = Metrics(), Clock()
     reads = stats(metrics, clock)
     for key, count in (("pose", 10), ("sensor", 40), ("map", 0)):
-        metrics.count("published", key=key).value += count
+        metrics.count("bus_messages", direction="out", kind=key).value += count
     metrics.count("camera_published").value += 5
     clock.now += 2.0
     assert reads.read().rates == {"pose": 5.0, "sensor": 20.0, "image": 2.5}
     clock.now += 1.0
-    metrics.count("published", key="pose").value += 1
+    metrics.count("bus_messages", direction="out", kind="pose").value += 1
     assert reads.read().rates == {"pose": 1.0}
 
 
@@ -57,9 +57,9 @@ def test_gaps_refusals_and_drops_are_summed_over_all_parts_of_the_gateway() -> N
     metrics, clock = Metrics(), Clock()
     metrics.count("sequence_gaps", link="a").value = 2
     metrics.count("sequence_gaps", link="b").value = 3
-    metrics.count("refused").value = 7
-    metrics.count("bus_out_dropped", writer="stream").value = 11
-    metrics.count("audit_dropped").value = 13
+    metrics.count("refused", code="held").value = 7
+    metrics.count("bus_dropped", queue="bus_in").value = 11
+    metrics.count("audit_lines_dropped").value = 13
     read = stats(metrics, clock).read(0.25)
     assert (read.stamp_ns, read.gaps, read.refused, read.dropped) == (12345, 5, 7, 24)
     assert (read.process.late_s, read.disks) == (0.25, (DiskSpace("audit", "/log/r1", 5),))

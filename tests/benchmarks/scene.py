@@ -12,7 +12,6 @@ import math
 import signal
 import tempfile
 import time
-import urllib.request
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -25,6 +24,7 @@ from tests.benchmarks.drives import ADVERSE
 from tests.benchmarks.harness import WAIT_S, Process, cpu_s, process, thread_cpu_s
 from tests.benchmarks.peer import ROBOT
 from tests.ports import free_port
+from tests.scraped import scrape, totals
 
 GREETING_S = 1.2
 """The gateway greets a robot with a stop, for a second."""
@@ -274,14 +274,11 @@ class Scene:
     def _counters(self) -> dict[str, int]:
         """Read what the gateway has refused, and dropped before it was looked at."""
         values = self.counters()
-        return {name: values[name] for name in ("refused", "bus_in_dropped")}
+        return {name: values[name] for name in ("refused", "bus_dropped")}
 
     def counters(self) -> dict[str, int]:
         """Read every counter of the gateway."""
-        with urllib.request.urlopen(f"http://127.0.0.1:{self._metrics_port}/metrics", timeout=WAIT_S) as page:
-            lines = page.read().decode().splitlines()
-        values = dict(line.rsplit(" ", 1) for line in lines if not line.startswith("#"))
-        return {name.removeprefix("zbridge_").replace("_total", ""): int(value) for name, value in values.items()}
+        return totals(scrape(self._metrics_port, timeout_s=WAIT_S))
 
 
 @contextlib.contextmanager

@@ -32,7 +32,7 @@ async def main() -> None:
     for number in range(COUNTERS):
         metrics.count(f"counter_{number % 40}", listener=str(number // 40)).value = number
     for key in ("pose", "map", "status", "sensor"):
-        metrics.count("published", key=key)
+        metrics.count("bus_messages", direction="out", kind=key)
     now = [0.0]
     usage = ProcessUsage(lambda: now[0])
     stats = GatewayStats("r1", metrics, usage, (), lambda: now[0], time.time_ns)
@@ -44,7 +44,7 @@ async def main() -> None:
             begun = time.process_time()
             for _ in range(options.messages):
                 now[0] += 1.0  # every fifth message begins the slow readings on their thread
-                metrics.count("published", key="pose").value += 20
+                metrics.count("bus_messages", direction="out", kind="pose").value += 20
                 publisher.put(payloads.encode(stats.read()))
                 await asyncio.sleep(0.002)
             costs.append((time.process_time() - begun) / options.messages)

@@ -90,7 +90,7 @@ async def test_what_the_holder_says_keeps_its_order_whatever_it_comes_by(rig: Ri
 async def test_a_full_queue_drops_its_oldest_item_counts_it_and_costs_no_higher_priority(rig, flood, other) -> None:
     rig.put(["first"], other)
     rig.put(range(QUEUE + 3), flood)
-    assert rig.metrics.total("bus_in_dropped") == 3
+    assert rig.metrics.total("bus_dropped") == 3
     assert await rig.drained() == ["first", *range(3, QUEUE + 3)]
 
 
@@ -110,7 +110,7 @@ async def test_a_flood_of_one_source_costs_no_item_of_another_and_no_more_than_i
 async def test_what_waits_has_a_bound_in_bytes_too(rig: Rig) -> None:
     rig.put(range(10), size=QUEUE_BYTES // 4)
     assert await rig.drained() == [6, 7, 8, 9]
-    assert rig.metrics.total("bus_in_dropped") == 6
+    assert rig.metrics.total("bus_dropped") == 6
     rig.put(range(4), size=QUEUE_BYTES // 4)
     assert (await rig.drained())[4:] == [0, 1, 2, 3], "what was served has made room"
 
@@ -135,7 +135,7 @@ async def test_a_stop_that_waits_makes_the_next_ones_of_its_robot_count_only(rig
         rig.source.fold(number, PriorityClass.STOP)
     rig.another_source().fold("another robot's", PriorityClass.STOP)
     assert await rig.drained() == [0, "another robot's"]
-    assert rig.metrics.total("bus_in_folded") == 999
+    assert rig.metrics.total("bus_stops_folded") == 999
 
     def stop(number: int) -> None:
         rig.seen.append(number)

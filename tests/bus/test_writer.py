@@ -108,7 +108,7 @@ def test_every_call_is_written_replaced_or_counted(
     assert not rig.relieved_on
     rig.end()
     assert " ".join(rig.written) == written
-    assert (rig.metrics.total("bus_out_dropped"), rig.metrics.total("bus_out_replaced")) == (dropped, replaced)
+    assert (rig.metrics.total("bus_dropped"), rig.metrics.total("bus_replaced")) == (dropped, replaced)
     assert len(rig.relieved_on) == relieved
 
 
@@ -236,4 +236,4 @@ def test_some_time_after_a_slow_call_small_ones_are_made_here_again(
 
 def test_a_call_that_fails_here_is_counted(lossy: Rig) -> None:
     lossy.writer.put_at_once(_fail, 3)
-    assert lossy.metrics.total("bus_out_dropped") == 3
+    assert lossy.metrics.total("bus_dropped") == 3

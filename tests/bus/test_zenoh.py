@@ -237,7 +237,7 @@ async def test_questions_beyond_the_rate_are_not_answered_and_counted(monkeypatc
     bus.answer("fleet/r1/@rpc/pose", lambda question: question.answer(b"yes"))
     answers = await asyncio.gather(*(bus.ask("fleet/r1/@rpc/pose", timeout_s=SOON_S) for _ in range(50)))
     assert 2 <= sum(map(len, answers)) < 50
-    assert metrics.total("bus_unanswered") == 50 - sum(map(len, answers))
+    assert metrics.total("bus_queries_unanswered") == 50 - sum(map(len, answers))
     await bus.close()
 
 

@@ -202,7 +202,7 @@ def test_a_flood_neither_pushes_out_what_was_there_before_nor_hides_what_happens
     assert sum(line.get("count", 1) for line in lines) >= 12 * PER_S, "and the flood itself is counted"
     assert len(lines) < 400
     assert len(caplog.records) < 400
-    assert metrics.total("audit_dropped") == 0
+    assert metrics.total("audit_lines_dropped") == 0
 
 
 def test_different_refusals_are_bounded_the_rest_is_counted_as_others_and_none_hides_a_stop(log: Log) -> None:
@@ -343,7 +343,7 @@ def test_what_cannot_be_written_until_the_end_keeps_nobody_from_ending_and_is_co
     hear(told, why)
     file.close()
     assert threading.active_count() == threads
-    assert metrics.count("audit_dropped").value == lines
+    assert metrics.count("audit_lines_dropped").value == lines
     assert "Traceback" not in capfd.readouterr().err
 
 
@@ -370,7 +370,7 @@ def test_a_full_disk_is_said_once_and_what_waits_is_written_when_it_has_room_aga
     hear(told, None)
     file.close()
     assert path.read_text() == "a whole line\nand another\n", "a line that was half written is finished"
-    assert (metrics.total("audit_failed") >= 1, metrics.total("audit_dropped")) == (True, 0)
+    assert (metrics.total("audit_write_failures") >= 1, metrics.total("audit_lines_dropped")) == (True, 0)
     errors = [record.getMessage() for record in caplog.records if record.levelno == logging.ERROR]
     assert errors == [f"the audit log is not written: {FULL} ({path})"]
 
@@ -389,7 +389,7 @@ def test_a_pipe_is_written_when_somebody_reads_it_and_again_when_somebody_else_d
     with path.open() as reader:
         assert reader.readline() == "two\n"
         file.close()
-    assert metrics.count("audit_dropped").value == 0
+    assert metrics.count("audit_lines_dropped").value == 0
 
 
 @pytest.mark.parametrize("name", ["file/audit.jsonl", "folder", "file/deep/audit.jsonl"])
@@ -434,7 +434,7 @@ def disk(tmp_path: Path, metrics: Metrics, monkeypatch: pytest.MonkeyPatch) -> D
 
 
 def test_what_finds_no_room_is_dropped_and_counted_and_all_else_is_written_at_the_end(disk, metrics, tmp_path) -> None:
-    assert metrics.total("audit_dropped") == 0
+    assert metrics.total("audit_lines_dropped") == 0
     for _ in range(10):
         disk.file.write("no room for this one")  # and it returns, although the disk stands still
     closing = threading.Thread(target=disk.file.close)
@@ -442,7 +442,7 @@ def test_what_finds_no_room_is_dropped_and_counted_and_all_else_is_written_at_th
     disk.moves.set()
     closing.join(JOIN_S)
     assert (tmp_path / "audit.jsonl").read_text().splitlines() == disk.lines
-    assert metrics.total("audit_dropped") == 10
+    assert metrics.total("audit_lines_dropped") == 10
 
 
 def test_a_disk_that_never_moves_again_keeps_nobody_from_ending_and_what_is_given_up_is_counted(
@@ -452,6 +452,6 @@ def test_a_disk_that_never_moves_again_keeps_nobody_from_ending_and_what_is_give
     disk.file.close()
     (writer,) = disk.writers()
     assert writer.is_alive(), "nobody waited for the disk"
-    assert metrics.total("audit_dropped") == WAITING
+    assert metrics.total("audit_lines_dropped") == WAITING
     disk.moves.set()
     writer.join(JOIN_S)

@@ -13,6 +13,7 @@ from tests.proofs import numbered, proof, shown
 from tests.tables import documented, executed
 from zbridge.control.authority import Authority
 from zbridge.control.authority_machine import AuthorityMachine
+from zbridge.control.events import StopCause
 from zbridge.control.holders import ENDED
 from zbridge.errors import Code, Held, LeaseLost, NeutralFirst, Refused
 from zbridge.fleet.lease_messages import Acquire, Authorization, Lease
@@ -212,7 +213,7 @@ ASKED = Acquire(who="ann", priority=5, alive="ann.1", t=1000)
 def test_a_program_whose_grant_was_lost_asks_again_and_gets_another_lease_in_place_of_the_first() -> None:
     authority = Authority(LEASE_S, DEADMAN_S, numbered())
     first = authority.acquire(ASKED, NOW, 500.0)
-    authority.require_neutral("robot lost", stops=False)
+    authority.require_neutral("robot lost", StopCause.ROBOT_LOST, stops=False)
     authority.events()
     again = authority.acquire(msgspec.structs.replace(ASKED, t=2000), NOW + 1.0, 1500.0)
     assert (first.ok, again.ok, again.code) == (True, True, None)
@@ -454,7 +455,7 @@ def test_a_bounded_number_of_ended_leases_is_remembered() -> None:
 def test_holding_back_keeps_the_lease_and_demands_neutral(state: str, why: str, stops: bool) -> None:
     authority = made(state)
     for _ in range(3):
-        authority.require_neutral(why, stops=stops)
+        authority.require_neutral(why, StopCause.ROBOT_BUSY, stops=stops)
     who = " ann" if state in HELD else ""
     assert told(authority) == (3 if stops else 1) * [f"stopped{who} ({why}){STOPS if stops else ''}"], "always stops"
     assert authority.state == STATES[state][0]
@@ -488,7 +489,7 @@ def test_a_robot_that_moves_for_nobody_is_stopped_before_somebody_gets_it() -> N
 @pytest.mark.parametrize("stops", [True, False])
 def test_the_neutral_of_a_part_that_did_not_move_allows_no_motion(stops: bool) -> None:
     authority = made("moving")
-    authority.require_neutral("busy", stops=stops)
+    authority.require_neutral("busy", StopCause.ROBOT_BUSY, stops=stops)
     applied(moving=False, part="left motor")(authority)  # a program that drives may say this all the time
     must_be_neutral(authority, "busy")
     NEUTRAL(authority)
@@ -499,7 +500,7 @@ def test_each_part_that_moved_is_neutral_before_motion_or_all_at_once() -> None:
     for whole in (False, True):
         authority = made("moving")
         applied(moving=True, part="left motor")(authority)
-        authority.require_neutral("busy")
+        authority.require_neutral("busy", StopCause.ROBOT_BUSY)
         authority.applied("drive", NOW, moving=False, whole=whole)
         if not whole:
             must_be_neutral(authority, "busy")

@@ -17,7 +17,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 
 from tests.proofs import proof, shown
 from zbridge.control.authority import Authority
-from zbridge.control.events import EventKind
+from zbridge.control.events import EventKind, StopCause
 from zbridge.errors import Refused
 from zbridge.fleet.lease_messages import Acquire, Authorization, Lease
 
@@ -195,7 +195,7 @@ class Driving(RuleBasedStateMachine):
     @rule(stands=st.booleans())
     def require_neutral(self, stands: bool) -> None:
         """Become busy; or know that the robot stands, so that nobody need stop it."""
-        self.authority.require_neutral("robot lost" if stands else "busy", stops=not stands)
+        self.authority.require_neutral("robot lost" if stands else "busy", StopCause.ROBOT_LOST, stops=not stands)
         self.must_neutral = True
         self.not_rested |= self.moving_parts
         if stands:

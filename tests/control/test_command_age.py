@@ -15,6 +15,7 @@ from msgspec import UNSET
 
 from tests.proofs import numbered, proof, shown
 from zbridge.control.authority import Authority
+from zbridge.control.events import StopCause
 from zbridge.control.holders import CommandAge
 from zbridge.errors import Code, Malformed, NeutralFirst, Refused
 from zbridge.fleet.lease_messages import Acquire, Authorization, Lease
@@ -135,7 +136,7 @@ def test_a_stale_neutral_ends_motion_and_leaves_the_robot_needs_neutral() -> Non
     ann = Ann()
     ann.acquire()
     ann.command(1.0)
-    ann.authority.require_neutral("the robot's link stalled")
+    ann.authority.require_neutral("the robot's link stalled", StopCause.LINK_STALLED)
     assert ann.command(1.1, 0.9, moving=False)
     with pytest.raises(NeutralFirst):
         ann.authority.motion.check_motion()

@@ -15,7 +15,7 @@ from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
 from zbridge.control.context import Conditions, Faults, RobotContext
 from zbridge.control.enforcer import SUSPENDED_S, Enforcer
-from zbridge.control.events import CommandSender
+from zbridge.control.events import CommandSender, StopCause
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import Standstill
 from zbridge.errors import NeutralFirst, RateLimited
@@ -91,7 +91,7 @@ async def test_a_machine_that_was_suspended_stops_its_robot_and_ends_the_lease_b
 
 async def test_motion_that_was_stopped_while_it_was_written_is_not_counted_as_motion() -> None:
     rig = Rig()
-    rig.enforcer.require_neutral("the robot's link stalled", stops=True)
+    rig.enforcer.require_neutral("the robot's link stalled", StopCause.LINK_STALLED, stops=True)
     with pytest.raises(NeutralFirst):
         rig.enforcer.moved(PATH, FORWARD, rig.now, CommandSender("a", rig.now), moving=True)
     assert not rig.authority.motion.moving
@@ -107,7 +107,7 @@ async def test_limits_refuse_what_comes_too_often_and_slow_what_grows_too_fast_f
         rig.now += 0.25
     assert told == [Drive(forward=0.25), Drive(forward=0.5)]
     assert rig.metrics.count("drives_slowed").value == 2
-    rig.enforcer.stop("stop")
+    rig.enforcer.stop("stop", StopCause.COMMAND)
     rig.authority.acquire(Acquire(who="a"), rig.now)
     assert rig.drive() == Drive(forward=0.25), "a robot that was stopped begins from standing"
     rig.drive()
@@ -120,7 +120,7 @@ async def test_a_stop_ends_the_lease_and_is_counted_and_shown_and_the_next_one_i
     rig.drive()
     rig.enforcer.stop_commanded(Sample("fleet/r1/@cmd/stop", b""))
     assert (rig.machine.stops, rig.authority.state) == (1, "stopped")
-    assert rig.metrics.count("control", what="stopped").value == 1
+    assert rig.metrics.count("stops", cause="command").value == 1
     assert rig.shown[-1].state == "stopped"  # type: ignore[attr-defined]
     assert rig.enforcer.admission("fleet/r1/@cmd/stop", None, 0, bytes) is None
 

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import ast
-import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from docs.generate.__main__ import DOCS, PART, generated, rewritten
 from docs.generate.bus import declared
-from zbridge.hq.context import ListenerCounts
-from zbridge.views.ros2 import teleop
+from docs.generate.metrics import causes_of_stops
+from zbridge.control.events import StopCause
 
 ROOT = DOCS.parent
 PARTS = generated()
@@ -45,19 +42,5 @@ def test_every_key_has_its_place_in_the_table_of_its_class() -> None:
 # Metrics
 
 
-def counted() -> Iterator[str]:
-    """Give the name of every counter in the source; those that are composed are listed."""
-    for path in (*(ROOT / "zbridge").rglob("*.py"), *(ROOT / "gateways").rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "count":
-                name = node.args[0] if node.args else None
-                if isinstance(name, ast.Constant) and re.fullmatch(r"[a-z]\w+", str(name.value)):
-                    yield str(name.value)
-    yield from (f"hq_{field}" for field in ListenerCounts.__struct_fields__)
-    yield from (f"ros2_cmd_vel_{name}" for name in teleop._COUNTS)
-
-
-def test_the_page_of_metrics_names_every_counter_and_no_other() -> None:
-    rows = re.findall(r"^\| (`[^|]+) \|", (DOCS / "reference" / "metrics.md").read_text(), re.MULTILINE)
-    named = [name for row in rows for name in re.findall(r"`(\w+)`", row)]
-    assert sorted(named) == sorted(set(counted()))
+def test_every_cause_of_a_stop_is_explained() -> None:
+    assert [cause for cause, _ in causes_of_stops()] == [cause.value for cause in StopCause]

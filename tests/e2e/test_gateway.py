@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import json
-import re
 import signal
 import struct
 import threading
 import time
-import urllib.request
 from pathlib import Path
 
 import pytest
 
-from tests.e2e.conftest import WAIT_S, Bench, device, end, until
+from tests.e2e.conftest import Bench, device, end, until
 from tests.e2e.rigs.loss import router
 from tests.e2e.rigs.robots import MOVE, SETTINGS, STOP, Robot
 from tests.ports import free_port
+from tests.scraped import scrape, totals
 
 TEXT, MODE = 1, 10
 
@@ -131,9 +130,7 @@ def test_a_gateway_that_cannot_write_its_audit_log_says_so_once_serves_the_robot
     reason = "the audit log is not written: No space left on device"
     until(lambda: bench.fleet.reason() == reason, what="status that says so")
     assert bench.fleet.state() == "established"
-    with urllib.request.urlopen(f"http://127.0.0.1:{metrics}/metrics", timeout=WAIT_S) as page:
-        (failed,) = re.findall(r"^zbridge_audit_failed_total (\d+)$", page.read().decode(), re.MULTILINE)
-    assert int(failed) >= 1
+    assert totals(scrape(metrics))["audit_write_failures"] >= 1
     gateway.signal(signal.SIGTERM)
     bench.ended_within(gateway.process, 4.0)
     log = gateway.end()

@@ -18,6 +18,7 @@ from tests.fake_bus import FakeBus
 from tests.fake_link import FakeLink
 from tests.hq.gateway import KEYS, Gateway
 from zbridge.clocks import Clocks
+from zbridge.control.events import StopCause
 from zbridge.errors import EncodeError, ProtocolError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -264,8 +265,8 @@ class Scene:
         taken = (message for _, message in self.gateway.taken())
         return [message.forward for message in taken if isinstance(message, Drive) and message.moving]
 
-    def count(self, name: str) -> int:
-        return self.metrics.total(name)
+    def count(self, name: str, **labels: str) -> int:
+        return self.metrics.total(name, **labels)
 
     def robot_is(self, what: str) -> None:
         if what == "there":
@@ -339,13 +340,14 @@ STEPS: dict[str, Callable[[Scene, str], object]] = {
     "frozen": lambda scene, seconds: scene.skip(float(seconds)),
     "operator-drives": lambda scene, _: scene.gateway.authority.acquire(OPERATOR, scene.now),
     "operator-takes-over": lambda scene, _: scene.gateway.authority.takeover(OPERATOR, scene.now),
-    "gateway-refuses": lambda scene, why: scene.gateway.authority.require_neutral(why),  # motion, until neutral is said
+    "gateway-refuses": lambda scene, why: scene.gateway.authority.require_neutral(why, StopCause.ROBOT_BUSY),
     "gateway-forgets": lambda scene, _: scene.gateway.authority.stop("a new gateway knows of no lease"),
     "shown": lambda scene, _: scene.show(),
     "forget": lambda scene, _: scene.driven(),
     "ended": Scene.ended,  # a session, and why
 }
-COUNTS = ("accepted", "turned_away", "dropped", "left_out", "commands", "refused", "malformed")
+OUTCOMES = ("accepted", "turned_away")
+COUNTS = ("dropped", "left_out", "commands", "refused", "malformed_frames")
 LOOKS: dict[str, Callable[[Scene], str]] = {
     "clients": lambda scene: spelled(*sorted(scene.listener.clients)),
     "holder": lambda scene: scene.gateway.report().holder or NOTHING,
@@ -357,6 +359,7 @@ LOOKS: dict[str, Callable[[Scene], str]] = {
     "tokens": lambda scene: spelled(*(key.removeprefix(KEYS.alive("")) for key in scene.bus.network.tokens)),
     "active": lambda scene: spelled(*(client.number for client in scene.listener._active)),
     **{what: lambda scene, name=f"hq_{what}": spelled(scene.count(name)) for what in COUNTS},
+    **{what: lambda scene, what=what: spelled(scene.count("hq_connections", outcome=what)) for what in OUTCOMES},
     "sessions": lambda scene: spelled(*(client.session.state.value for client in scene.listener.clients.values())),
 }
 

@@ -78,7 +78,7 @@ async def test_a_listener_goes_on_without_what_its_protocol_fails_at_and_says_so
     assert scene.driven() == [0.5]
     await scene.play("robot gone; robot there; sessions established")
     assert scene.count("hq_left_out") >= 1 + 50 + 50 + 2
-    assert scene.count("hq_malformed") == 50
+    assert scene.count("hq_malformed_frames") == 50
     records = [*caplog.get_records("setup"), *caplog.records]
     errors = [record.getMessage() for record in records if record.levelno == logging.ERROR]
     assert sorted(errors) == [

@@ -83,7 +83,7 @@ rubbish ends its own session only, after what came before it
     a greets; b greets; a garbles stop; a is closed; ended toy.2 broken stream: length 255; stops 1; b says stop
     stops 2; b is open
 messages without meaning are counted and the next ones are taken
-    a greets; a says ?, sing, stop; malformed 2; stops 1; commands 1; a is open
+    a greets; a says ?, sing, stop; malformed_frames 2; stops 1; commands 1; a is open
 of a stream a slow client gets the newest
     a greets; a stalls; at 1; at 2; at 3; a takes; a hears at 3; dropped 0
 nothing is encoded for nobody

@@ -63,7 +63,10 @@ async def test_254_clients_are_served_and_the_255th_is_turned_away_until_one_lea
     late = scene.connect()
     late.say(b"hi", b"go")
     assert (late.link.closed, late.heard()) == (True, [])
-    assert (scene.count("hq_accepted"), scene.count("hq_turned_away")) == (254, 1)
+    assert (
+        scene.count("hq_connections", outcome="accepted"),
+        scene.count("hq_connections", outcome="turned_away"),
+    ) == (254, 1)
     await soon()
     scene.pose(3.0)
     assert all(program.heard() == [b"at 3"] for program in programs)
@@ -79,7 +82,10 @@ async def test_twenty_connections_a_second_of_one_address_are_let_in_unless_told
     assert [program.link.closed for program in programs] == [False] * 20 + [True] * 5
     assert programs[24].heard() == []
     assert not scene.connect("10.0.0.2").link.closed, "another address"
-    assert (scene.count("hq_accepted"), scene.count("hq_turned_away")) == (21, 5)
+    assert (
+        scene.count("hq_connections", outcome="accepted"),
+        scene.count("hq_connections", outcome="turned_away"),
+    ) == (21, 5)
     programs[0].leave()
     await soon()
     assert scene.connect().link.closed, "that one has left makes no room"
@@ -101,9 +107,11 @@ async def test_a_flood_of_connections_costs_a_few_lines_a_second(accept_hz, capl
     assert len(lines) <= 20, lines
     came = sum(int(count) for line in lines for count in re.findall(r"(\d+) more connected", line))
     told = sum("10.0.0.1:" in line and "connected as client" in line for line in lines)
-    assert came + told == scene.count("hq_accepted") - 1
+    assert came + told == scene.count("hq_connections", outcome="accepted") - 1
     away = sum(int(count) for line in lines for count in re.findall(r"(\d+) more turned away", line))
-    assert away + sum(" turned away (" in line for line in lines) == scene.count("hq_turned_away")
+    assert away + sum(" turned away (" in line for line in lines) == scene.count(
+        "hq_connections", outcome="turned_away"
+    )
     assert any("tcp://10.0.0.9" in line and "connected as client" in line for line in lines), "others are told of"
 
 
@@ -154,7 +162,7 @@ async def test_many_clients_come_and_go_and_leave_nothing_behind(scene: Scene) -
 @pytest.mark.scene(allow=("10.0.0.0/8", "192.168.1.7/32", "fd00::/8"))
 async def test_only_allowed_networks_are_let_in_and_who_is_turned_away_uses_up_no_number(scene, host, welcome) -> None:
     assert scene.connect(host).link.closed is not welcome
-    assert scene.count("hq_turned_away") == (not welcome)
+    assert scene.count("hq_connections", outcome="turned_away") == (not welcome)
     assert list(scene.listener.clients) == [2] * welcome
     await soon()
     scene.connect("10.9.9.9")

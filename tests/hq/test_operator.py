@@ -13,6 +13,7 @@ from tests.bounds import most_kept
 from tests.fake_bus import FakeBus
 from tests.hq.gateway import KEYS, Gateway
 from tests.hq.scripts import scripts
+from zbridge.control.events import StopCause
 from zbridge.errors import BusError, Code, Refused
 from zbridge.fleet import topics
 from zbridge.fleet.lease_messages import Acquire
@@ -220,7 +221,7 @@ STEPS: dict[str, Callable[[Scene, str], object]] = {
     "operator-drives": lambda scene, _: scene.authority.acquire(OPERATOR, scene.now),
     "operator-takes-over": lambda scene, _: scene.authority.takeover(OPERATOR, scene.now),
     "somebody-stops": lambda scene, _: scene.authority.stop("stop"),
-    "busy": lambda scene, why: scene.authority.require_neutral(why),
+    "busy": lambda scene, why: scene.authority.require_neutral(why, StopCause.ROBOT_BUSY),
     "bus-fails": lambda scene, _: scene.block(fails=True),
     "bus-blocked": lambda scene, _: scene.block(fails=False),
     "bus-freed": lambda scene, _: scene.freed.set(),

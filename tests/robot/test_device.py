@@ -102,14 +102,14 @@ async def test_a_lost_robot_is_offline_with_the_reason_remembered_and_publishes_
 async def test_what_a_read_brings_is_published_in_order_and_counted_and_what_has_no_meaning_only_counted(rig) -> None:
     seen: list[str] = []
     rig.hq.subscribe("fleet/r1/*", lambda sample: seen.append(sample.key.rpartition("/")[2]))
-    before = rig.metrics.total("published")
+    before = rig.metrics.total("bus_messages")
     no_square, no_mode = bytes.fromhex("0b000000 01 35 05000000 0000000000"), bytes.fromhex("06000000 01 33 07000000")
     rig.sends(POSITION + BYE + no_square + no_mode + POSITION + LIDAR_IS_ON)
     assert sorted(seen) == ["lidar", "pose", "pose", "text"]
     rig.sends(MAP)
     assert seen[4:] == ["map"]
-    assert rig.metrics.total("published") == before + 5
-    assert rig.metrics.total("untranslatable") == 2
+    assert rig.metrics.total("bus_messages") == before + 5
+    assert rig.metrics.total("untranslatable_messages") == 2
     assert rig.last("lidar") == {"on": True, "stamp_ns": 1234}
     assert rig.last("pose")["x"] == pytest.approx(1.5)  # 150 cm
     assert rig.last("map")["cells"] == bytes([0, 2, 1, 1, 2, 0, 2, 0, 1])
@@ -123,7 +123,7 @@ async def test_a_malformed_packet_costs_itself_and_a_broken_stream_the_session_b
     rig.hq.subscribe("fleet/r1/pose", lambda sample: seen.append("pose"))
     rig.hq.subscribe("fleet/r1/status", lambda sample: seen.append(msgpack.unpackb(sample.payload)["state"]))
     rig.sends(bytes.fromhex("03000000 01 37 00") + POSITION)
-    assert (seen, rig.metrics.total("malformed")) == (["pose"], 1)
+    assert (seen, rig.metrics.total("malformed_frames")) == (["pose"], 1)
     rig.sends(POSITION + bytes(6))
     await rig.settle()
     assert seen == ["pose", "pose", "offline"]
@@ -559,7 +559,7 @@ async def test_a_command_or_part_of_it_that_cannot_be_carried_out_is_refused_wit
     rig.command(name, fields)
     who = "driver" if name in ("drive", "raw/other") else "-"
     await rig.play(f"0.1 > {sent}\n refused {who} {name}: {reason}")
-    assert (rig.metrics.total("commands"), rig.metrics.total("refused")) == (1, 1)
+    assert (rig.metrics.total("bus_messages", direction="in"), rig.metrics.total("refused")) == (1, 1)
 
 
 async def test_a_scan_that_is_sent_to_the_robot_is_shown_on_the_bus(rig: Rig) -> None:
@@ -586,8 +586,12 @@ async def test_the_audit_log_tells_who_drove_what_was_refused_and_what_stopped_t
         {"event": "stopped", "reason": "robot lost"},
     ]
     assert {json.loads(line)["robot"] for line in rig.audit_lines} == {"r1"}
-    counted = {labels[0][1]: value for name, labels, value in rig.metrics if name == "control"}
-    assert counted == {"acquired": 2, "stopped": 3, "ended": 1, "taken over": 1, "released": 1}
+    counted = {(name, labels[0][1]): value for name, labels, value in rig.metrics if name in ("lease_changes", "stops")}
+    changes = {"acquired": 2, "ended": 1, "taken_over": 1, "released": 1}
+    causes = {"deadman": 1, "taken_over": 1, "command": 1, "robot_lost": 1}
+    assert counted == {("lease_changes", change): count for change, count in changes.items()} | {
+        ("stops", cause): count for cause, count in causes.items()
+    }
 
 
 def gate(rig: Rig, path: str) -> Callable[..., PriorityClass | None]:

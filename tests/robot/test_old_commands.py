@@ -65,7 +65,7 @@ async def test_what_may_move_the_robot_is_not_sent_late_and_its_sender_is_shown_
         (refusal,) = rig.last("control")["refusals"]
         assert (refusal["who"], refusal["command"], refusal["code"]) == ("ann", command, "stale")
         assert refusal["reason"] == "the command is too old: the network delayed it"
-        assert rig.metrics.total("commands_stale") == 1
+        assert rig.metrics.total("refused", code="stale") == 1
         await ann.says(word)
         assert words(rig) == [word], "the next one is in time"
 

@@ -245,7 +245,7 @@ MUTANTS = (
         "drives wait for a stalled link for ever",
         "situations",
         PRESENCE,
-        '            self._enforcer.require_neutral("the robot\'s link stalled", stops=True)',
+        '            self._enforcer.require_neutral("the robot\'s link stalled", StopCause.LINK_STALLED, stops=True)',
         "            pass",
     ),
     Mutant(
@@ -299,7 +299,13 @@ MUTANTS = (
         "            OwnershipInput.OUTBID: (_withdraw, OwnershipState.LOOKING),",
         "            OwnershipInput.OUTBID: (_withdraw, OwnershipState.LOOKING),",
     ),
-    Mutant("robot not stopped by who yields", "situations", DEVICE, "        self.enforcer.stop(_ASIDE)\n", ""),
+    Mutant(
+        "robot not stopped by who yields",
+        "situations",
+        DEVICE,
+        "        self.enforcer.stop(_ASIDE, StopCause.ANOTHER_GATEWAY)\n",
+        "",
+    ),
     Mutant(
         "claim without latches",
         "ownership",

@@ -30,8 +30,9 @@ FOUND = (
     _mutant(
         "a suspension ends no lease of a robot that does not move",
         ENFORCER,
-        '            self.stop(f"the gateway\'s machine was suspended for {asleep_s:.1f} s")\n',
-        "            if self.authority.motion.moving:\n                self.stop(f'suspended for {asleep_s:.1f} s')\n",
+        '            self.stop(f"the gateway\'s machine was suspended for {asleep_s:.1f} s", StopCause.SUSPENDED)\n',
+        "            if self.authority.motion.moving:\n"
+        "                self.stop(f'suspended for {asleep_s:.1f} s', StopCause.SUSPENDED)\n",
     ),
     _mutant(
         "a takeover does not wait for the fleet's latched stops",
@@ -153,10 +154,10 @@ FOUND = (
         self._refuse_all(None)
         self._latch_news.returned()
         self._standstill.begin()
-        self.enforcer.stop("served again")
+        self.enforcer.stop("served again", StopCause.ANOTHER_GATEWAY)
 """,
         """        self.observed.aside = False
-        self.enforcer.stop("served again")
+        self.enforcer.stop("served again", StopCause.ANOTHER_GATEWAY)
         for connection in self._links:
             connection.mute(False)
         self._publishers.mute(False)

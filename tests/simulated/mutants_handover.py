@@ -17,7 +17,7 @@ HANDOVER = (
     _mutant(
         "the robot is not stopped before a restart",
         DEVICE,
-        "        self.enforcer.stop(reason)\n        self._context.pump()\n",
+        "        self.enforcer.stop(reason, StopCause.RESTART)\n        self._context.pump()\n",
         "        self._context.pump()\n",
     ),
     _mutant(

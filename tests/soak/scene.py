@@ -10,7 +10,6 @@ import contextlib
 import json
 import sys
 import time
-import urllib.request
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,6 +24,7 @@ from tests.e2e.rigs.fragile import ROBOTS, charges
 from tests.e2e.rigs.moving_robot import MovingRobot
 from tests.e2e.rigs.processes import LINE_S, Namespace, Part, ip
 from tests.e2e.rigs.supervised import Supervised, children
+from tests.scraped import scrape, totals
 from tests.soak import counted
 from tests.soak.network import Link
 
@@ -36,7 +36,7 @@ NEW_S = 15.0
 """Seconds without a session after which somebody starts a robot's program again."""
 _JOINED = "in one read: "
 """What robots say of packets that a link has joined, which loses some and delivers them again."""
-LOSS_COUNTERS = ("bus_out_dropped", "bus_out_replaced", "untranslatable", "malformed", "names_dropped")
+LOSS_COUNTERS = ("bus_dropped", "bus_replaced", "untranslatable_messages", "malformed_frames", "names_dropped")
 
 
 @dataclass(frozen=True)
@@ -234,11 +234,4 @@ class Scene:
 
     def counters(self) -> Counter[str]:
         """Read the counters of the counted robot's gateway, over the bus's link."""
-        with urllib.request.urlopen(f"http://{self.bus_link.far}:{METRICS_PORT}/metrics", timeout=5) as answer:
-            lines = answer.read().decode().splitlines()
-        found: Counter[str] = Counter()
-        for line in lines:
-            if not line.startswith("#"):
-                name, _, value = line.rpartition(" ")
-                found[name.partition("{")[0].removeprefix("zbridge_").removesuffix("_total")] += int(float(value))
-        return found
+        return totals(scrape(METRICS_PORT, host=self.bus_link.far))

@@ -84,7 +84,7 @@ async def test_what_comes_while_nothing_is_read_is_dropped_and_told() -> None:
     scene.link.pause_reading()
     scene.other.frames("k", lambda listened: None).put(b"lost")
     scene.link.resume_reading()
-    scene.metrics.count("bus_in_dropped").value += 2
+    scene.metrics.count("bus_dropped", queue="bus_in").value += 2
     scene.link._report()
     told = [sample.count for sample in scene.read if sample.kind is SampleKind.DROPPED]
     assert told == [3]

@@ -12,16 +12,17 @@ import contextlib
 import logging
 import math
 import socket
-from collections.abc import Coroutine
+from collections.abc import Coroutine, Iterator
 from functools import partial
 from typing import Any
 
 import msgspec
 
 from zbridge.app.config import GatewayPlan
+from zbridge.app.endpoint import serve_metrics
 from zbridge.app.handover import ClaimPart, ColdStart, Incoming, Restarts, Successor
 from zbridge.app.joining import SessionUseless, watch_certificate, watch_session
-from zbridge.app.prometheus import serve_metrics
+from zbridge.app.readings import LoopLateness, robot_readings, session_readings
 from zbridge.app.runtime import RUNTIME, Runtime, open_audit
 from zbridge.app.serving import SERVED_ELSEWHERE, Begin, Serving
 from zbridge.app.stats import GatewayStats, StatsPublisher, disks_of
@@ -39,7 +40,7 @@ from zbridge.fleet.processes import Sessions
 from zbridge.fleet.topics import KeySpace
 from zbridge.hq import Listener, RobotSubscription
 from zbridge.hq.names import listener_names, process_name
-from zbridge.metrics import Metrics
+from zbridge.metrics import Metrics, Reading
 from zbridge.protocol.address import Address
 from zbridge.protocol.kept import Exported
 from zbridge.protocol.session_table import SessionTable
@@ -56,6 +57,11 @@ log = logging.getLogger("zbridge.app.gateway")
 
 LINGER_S = 0.2
 """Seconds between a handover and the end of the bus session: closing it drops what Zenoh has not yet sent."""
+
+
+def robot_metrics(plan: GatewayPlan, metrics: Metrics) -> Metrics:
+    """Return the part of a process's metrics that a robot's gateway has: all bear its realm and name."""
+    return metrics.labelled(realm=plan.config.robot.realm, robot=plan.config.robot.name)
 
 
 class Neighbourhood(msgspec.Struct, frozen=True):
@@ -101,7 +107,7 @@ class Gateway:
         """What is handed to a successor, and how."""
         self.left = True
         """Whether the bus was closed in order; if not, one of its threads may hang."""
-        self.metrics = metrics or Metrics()
+        self.metrics = metrics or robot_metrics(plan, Metrics())
         self.sessions = SessionTable()
         self.conditions = Conditions()
         self._own = own_name(plan.config.bus.tls)
@@ -153,6 +159,10 @@ class Gateway:
         await self._incoming.receive()
         async with contextlib.AsyncExitStack() as stack:
             stack.callback(bus.watch_connected(self._on_bus).close)
+            stack.callback(self.metrics.add_source(self._readings))
+            if alone:
+                stack.callback(self.metrics.add_source(self._runtime.usage.readings))
+                stack.callback(LoopLateness(self.metrics).begin())
             robot = RobotSubscription(bus, self._keys, self.metrics)
             listeners = self._listeners(bus, robot)
             self._stats = self._read_stats(listeners)
@@ -207,6 +217,12 @@ class Gateway:
         usage = runtime.usage
         usage.disks[robot] = disks_of(self._plan, runtime.folder)
         return GatewayStats(robot, self.metrics, usage, listeners, runtime.clock, runtime.clock_ns)
+
+    def _readings(self) -> Iterator[Reading]:
+        yield "bus_connected", {}, int(self._on_the_bus)
+        yield from session_readings(self.sessions)
+        if self._plan.device is not None:
+            yield from robot_readings(self.restarts.device, self._plan.device.protocol.name)
 
     def missing(self) -> tuple[str, ...]:
         """Return why this gateway cannot serve its robot now: no bus, or the robot is not established."""

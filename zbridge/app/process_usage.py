@@ -8,14 +8,17 @@ every :data:`SLOW_S`; the next one begins only when the one before has ended.
 from __future__ import annotations
 
 import os
+import platform
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
+from importlib.metadata import version
 from pathlib import Path
 
 from zbridge.fleet.processes import DiskSpace, ProcessStats
+from zbridge.metrics import Reading
 from zbridge.version import __version__
 
 APART_S = 0.5
@@ -24,6 +27,8 @@ SLOW_S = 5.0
 """Seconds between two readings of what takes time."""
 _TICKS_AT = 19
 """Where ``/proc/self/stat`` has the time of the start, counted after the name of the program."""
+
+VERSIONS = {"version": __version__, "python": platform.python_version(), "zenoh": version("eclipse-zenoh")}
 
 Disks = tuple[tuple[str, Path], ...]
 """What is written, and where: ``(("audit", Path("/var/log/zbridge/r1.log")),)``."""
@@ -58,6 +63,16 @@ class ProcessUsage:
         if self._last is None or now - self._at >= APART_S:
             self._last = self._read(now)
         return self._last
+
+    def readings(self) -> Iterator[Reading]:
+        """Return what the metrics show of the process."""
+        stats = self.read()
+        yield "process_cpu_seconds", {}, time.process_time()
+        yield "process_resident_memory_bytes", {}, stats.resident_bytes
+        yield "process_open_fds", {}, stats.files
+        yield "process_max_fds", {}, stats.most_files
+        yield "process_start_time_seconds", {}, round(time.time() - stats.uptime_s, 1)
+        yield "build_info", VERSIONS, 1
 
     def free(self, robot: str) -> tuple[DiskSpace, ...]:
         """Return the space on the disks of a robot's gateway, as it was read last."""

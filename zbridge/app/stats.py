@@ -81,8 +81,8 @@ class GatewayStats:
         since_s, self._at = max(now - self._at, 1e-3), now
         counted = Counter[str]()
         for name, labels, value in counters:
-            if name == "published":
-                counted[dict(labels)["key"]] += value
+            if name == "bus_messages" and ("direction", "out") in labels:
+                counted[dict(labels)["kind"]] += value
             elif name == "camera_published":
                 counted[topics.IMAGE.path] += value
         before, self._published = self._published, counted

@@ -17,12 +17,13 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import time
 from collections import deque
 from collections.abc import Callable
 from typing import Any
 
 from zbridge.bus.interface import PriorityClass
-from zbridge.metrics import Count, Metrics
+from zbridge.metrics import Count, Histogram, Metrics
 
 log = logging.getLogger("zbridge.bus")
 
@@ -32,6 +33,9 @@ QUEUE_BYTES = 4 * 2**20
 """Bytes of one source's items of one priority class that may wait; more drop the oldest."""
 SHARES = {PriorityClass.STOP: 64, PriorityClass.LATCH: 64, PriorityClass.COMMAND: 128, PriorityClass.OTHER: 64}
 """Items of each priority class that one batch serves at most."""
+
+TIMED = frozenset({PriorityClass.STOP, PriorityClass.COMMAND})
+"""Priority classes of which is measured how long their items wait and are handled."""
 
 Handler = Callable[[Any], None]
 Read = Callable[[Any], Any]
@@ -45,8 +49,11 @@ class Inbox:
         self._lines: dict[PriorityClass, deque[_Queue]] = {priority: deque() for priority in PriorityClass}
         self.commands = _Queue()
         self._awake = False
-        self._dropped = metrics.count("bus_in_dropped")
-        self._folded = metrics.count("bus_in_folded")
+        self._dropped = metrics.count("bus_dropped", queue="bus_in")
+        self._folded = metrics.count("bus_stops_folded")
+        self._metrics = metrics
+        self._handled: Histogram | None = None
+        """From arrival until the handler has returned; made with the first command."""
 
     def source(self, handler: Handler, read: Read | None = None) -> Source:
         """Make the source of one subscription or queryable.
@@ -54,6 +61,11 @@ class Inbox:
         read: converts each item for the handler, on the event loop's thread; None: the handler gets the item itself.
         """
         return Source(self, handler, read, self._dropped, self._folded)
+
+    @property
+    def length(self) -> int:
+        """How many items wait, about."""
+        return sum(len(queue.items) for line in self._lines.values() for queue in set(line))
 
     def attend(self) -> None:
         """Serve the stops and commands that wait, and nothing else."""
@@ -92,7 +104,7 @@ class Inbox:
         queue = line.popleft()
         queue.listed = False  # before the item is taken: a later item lists the queue again
         try:
-            source, raw, size = queue.items.popleft()
+            source, raw, size, at = queue.items.popleft()
         except IndexError:  # the queue was listed twice, or its items were dropped
             return
         queue.taken += size
@@ -103,6 +115,10 @@ class Inbox:
             source.handler(raw if source.read is None else source.read(raw))
         except Exception:
             log.exception("a handler failed")
+        if at:
+            if self._handled is None:
+                self._handled = self._metrics.histogram("bus_to_socket_seconds")
+            self._handled.observe(time.monotonic() - at)
 
 
 class Source:
@@ -132,7 +148,7 @@ class Source:
                 queue.forgotten += queue.items.popleft()[2]
             self._dropped.value += 1
         queue.added += size
-        queue.items.append((self, raw, size))
+        queue.items.append((self, raw, size, time.monotonic() if priority in TIMED else 0.0))
         self._inbox.line_up(queue, priority)
 
     def fold(self, raw: Any, priority: PriorityClass) -> None:
@@ -141,7 +157,7 @@ class Source:
         if queue.items:
             self._folded.value += 1
         else:
-            queue.items.append((self, raw, 0))
+            queue.items.append((self, raw, 0, time.monotonic() if priority in TIMED else 0.0))
         self._inbox.line_up(queue, priority)
 
 
@@ -150,7 +166,8 @@ class _Queue:
 
     def __init__(self) -> None:
         self.listed = False
-        self.items: deque[tuple[Source, Any, int]] = deque()
+        self.items: deque[tuple[Source, Any, int, float]] = deque()
+        """Source, item, bytes, and when it arrived if that is measured."""
         self.added = 0
         """Bytes that were added, as of the threads that add; so is ``forgotten``."""
         self.forgotten = 0

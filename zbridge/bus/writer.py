@@ -54,10 +54,15 @@ class Writer:
         self._lock = threading.Lock()
         self._bell: SimpleQueue[None] = SimpleQueue()
         self._rung = False
-        self._dropped = metrics.count("bus_out_dropped", writer=name)
-        self._replaced = metrics.count("bus_out_replaced", writer=name)
+        self._dropped = metrics.count("bus_dropped", queue=f"bus_out_{name}")
+        self._replaced = metrics.count("bus_replaced", queue=f"bus_out_{name}")
         self._thread = threading.Thread(target=self._run, name=f"zbridge-{name}", daemon=True)
         self._thread.start()
+
+    @property
+    def length(self) -> int:
+        """How many messages wait."""
+        return self._backlog + len(self._latest)
 
     def put(self, call: Call, size: int = 1) -> bool:
         """Queue a call of ``size`` messages; False asks to pause the source."""

@@ -164,8 +164,8 @@ class AuditFile:
         days: float = 0.0,
         tell: Callable[[str | None], object] = lambda text: None,
     ) -> None:
-        self._dropped = metrics.count("audit_dropped")
-        self._failed = metrics.count("audit_failed")
+        self._dropped = metrics.count("audit_lines_dropped")
+        self._failed = metrics.count("audit_write_failures")
         self._tell = tell
         self._path = path
         self._failing = False

@@ -27,7 +27,7 @@ from zbridge.control.authority_machine import AuthorityMachine
 from zbridge.control.events import AuthorityEvent as Event
 from zbridge.control.events import AuthorityInput as Input
 from zbridge.control.events import AuthorityState as State
-from zbridge.control.events import Cause, EventKind
+from zbridge.control.events import Cause, EventKind, StopCause
 from zbridge.control.events import CommandSender as Sender
 from zbridge.control.holders import MAX_AGE_S
 from zbridge.control.latch import Latches, LatchRecord
@@ -146,9 +146,9 @@ class Authority:
 
     # Stops
 
-    def stop(self, reason: str) -> None:
+    def stop(self, reason: str, cause: StopCause = StopCause.COMMAND) -> None:
         """Stop the robot and end the lease, whoever asks: nobody drives before acquiring anew."""
-        self.machine.handle(Input.STOP, Cause(reason=reason, kind=EventKind.STOPPED))
+        self.machine.handle(Input.STOP, Cause(reason=reason, kind=EventKind.STOPPED, stop=cause))
 
     def take_stop(self, stop: Stop, *, fleet: bool) -> None:
         """Stop the robot as somebody on the bus demands. fleet: all robots of the realm were sent this stop."""
@@ -161,7 +161,8 @@ class Authority:
     def latch(self, *latches: Latch) -> None:
         """Stop the robot and end the lease for latched stops that have just come into force."""
         for latch in latches:
-            cause = Cause(reason=latch.reason or "stop", kind=EventKind.LATCHED, who=latch.who)
+            reason = latch.reason or "stop"
+            cause = Cause(reason=reason, kind=EventKind.LATCHED, who=latch.who, stop=StopCause.LATCH)
             self.machine.handle(Input.LATCH, cause)
 
     def merge(self, record: LatchRecord) -> None:
@@ -186,14 +187,14 @@ class Authority:
         if self.latches:
             self.machine.state = State.LATCHED
 
-    def require_neutral(self, reason: str, *, stops: bool = True) -> None:
+    def require_neutral(self, reason: str, cause: StopCause, *, stops: bool = True) -> None:
         """Stop the robot, or (``stops=False``) record that it is stopped; motion needs a neutral first."""
-        self.machine.handle(Input.REQUIRE_NEUTRAL, Cause(reason=reason, stops=stops))
+        self.machine.handle(Input.REQUIRE_NEUTRAL, Cause(reason=reason, stops=stops, stop=cause))
 
     def vanished(self, alive: str) -> None:
         """Record that a liveliness token is gone; if the holder named it, the lease ends."""
         if self.holders.current is not None and self.holders.current.alive == alive:
-            self.machine.handle(Input.HOLDER_LOST, Cause(reason="holder lost"))
+            self.machine.handle(Input.HOLDER_LOST, Cause(reason="holder lost", stop=StopCause.HOLDER_LOST))
 
     def bus_lost(self) -> None:
         """Record that no other process can reach the gateway any more; the lease ends.
@@ -204,7 +205,7 @@ class Authority:
         current = self.holders.current
         if self._alone_is_normal and current is not None and current.alive is not None:
             return
-        self.machine.handle(Input.BUS_LOST, Cause(reason="bus lost"))
+        self.machine.handle(Input.BUS_LOST, Cause(reason="bus lost", stop=StopCause.BUS_LOST))
 
     # Time
 
@@ -217,9 +218,9 @@ class Authority:
     def expire(self, now: float) -> None:
         """Do what is due: end a lease that was not renewed, stop motion that was not repeated."""
         if self.holders.current is not None and now >= self.holders.current.expires_at:
-            self.machine.handle(Input.EXPIRED, Cause(reason="lease expired"))
+            self.machine.handle(Input.EXPIRED, Cause(reason="lease expired", stop=StopCause.LEASE_EXPIRED))
         elif now >= self.motion.stop_at:
-            self.machine.handle(Input.DEADMAN, Cause(reason="deadman"))
+            self.machine.handle(Input.DEADMAN, Cause(reason="deadman", stop=StopCause.DEADMAN))
 
     # What happened
 

@@ -22,7 +22,7 @@ from zbridge.control.commanded_motion import CommandedMotion
 from zbridge.control.events import AuthorityEvent as Event
 from zbridge.control.events import AuthorityInput as Input
 from zbridge.control.events import AuthorityState as State
-from zbridge.control.events import Cause, EventKind
+from zbridge.control.events import Cause, EventKind, StopCause
 from zbridge.control.holders import CommandAge, Holder, Holders
 from zbridge.control.latch import Latches
 from zbridge.control.requests import capped, name_of
@@ -66,9 +66,10 @@ class AuthorityMachine:
         who, lease_s = name_of(request), capped("lease_s", request.lease_s, self.lease_s)
         deadman_s = capped("deadman_s", request.deadman_s, self.deadman_s)
         if self.holders.current is not None:
-            self._end(Cause(reason=f"taken over by {who}"))
+            self._end(Cause(reason=f"taken over by {who}", stop=StopCause.TAKEN_OVER))
         elif self.motion.moving:
-            self._require_neutral(Cause(reason=f"moving without a driver when {who} acquired"))
+            reason = f"moving without a driver when {who} acquired"
+            self._require_neutral(Cause(reason=reason, stop=StopCause.UNDRIVEN))
         lease, token = self.holders.new_lease()
         verifier, self.motion.deadman_s = Verifier(lease, token), deadman_s
         age = CommandAge(min(self._max_age_s, deadman_s) if self._max_age_s < math.inf else math.inf)
@@ -108,7 +109,7 @@ class AuthorityMachine:
     def _give_back(self, cause: Cause) -> None:
         """End the lease if its holder asks; raise Refused for other senders."""
         self._questioner(cause)
-        self._end(Cause(reason="released", kind=EventKind.RELEASED))
+        self._end(Cause(reason="released", kind=EventKind.RELEASED, stop=StopCause.RELEASED))
 
     def _move(self, cause: Cause) -> None:
         """Start the deadman."""
@@ -128,7 +129,7 @@ class AuthorityMachine:
         motion, holder = self.motion, self.holders.current
         if cause.stops or motion.moving or motion.needs_neutral != cause.reason:
             who = holder.who if holder is not None else None
-            self.events.append(Event(EventKind.STOPPED, who, cause.reason, stops=cause.stops))
+            self.events.append(Event(EventKind.STOPPED, who, cause.reason, stops=cause.stops, cause=cause.stop))
         motion.require_neutral(cause.reason)
 
     def _end(self, cause: Cause) -> None:
@@ -138,7 +139,7 @@ class AuthorityMachine:
         self.motion.end()
         self.motion.deadman_s = self.deadman_s
         who = cause.who if cause.kind is EventKind.LATCHED else holder.who if holder else None
-        self.events.append(Event(cause.kind, who, cause.reason, stops=stops))
+        self.events.append(Event(cause.kind, who, cause.reason, stops=stops, cause=cause.stop if stops else None))
 
     def _refuse_latched(self, cause: Cause) -> Lease:
         """Refuse the lease, and say who latched the robot."""

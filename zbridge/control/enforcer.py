@@ -21,7 +21,8 @@ from zbridge.control.admission import CommandFilter, RefusalLimit
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
 from zbridge.control.context import RobotContext
-from zbridge.control.events import CommandSender, EventKind
+from zbridge.control.event_counts import EventCounts
+from zbridge.control.events import CommandSender, EventKind, StopCause
 from zbridge.control.latch import Latches, LatchRecord, read_stop
 from zbridge.control.lease_hook import LeaseHook
 from zbridge.control.motion_limits import MotionLimits
@@ -82,10 +83,9 @@ class Enforcer:
         self._timer_at = math.inf
         self._control_due: asyncio.TimerHandle | None = None
         self._closed = False
-        self._refused = context.metrics.count("refused")
+        self._counts = EventCounts(context.metrics)
         self._same_stops = context.metrics.count("stops_folded")
         self._slowed = context.metrics.count("drives_slowed")
-        self._stale = context.metrics.count("commands_stale")
         self._remind()
 
     def __repr__(self) -> str:
@@ -103,7 +103,6 @@ class Enforcer:
     def require_fresh(self, sender: CommandSender) -> None:
         """Raise Refused for a command that is too old to set the robot in motion."""
         if sender.stale:
-            self._stale.value += 1
             raise Stale("the command is too old: the network delayed it")
 
     def permit(self, command: Drive | Motor, now: float) -> Drive | Motor:
@@ -141,9 +140,9 @@ class Enforcer:
 
     # Stops
 
-    def stop(self, reason: str) -> None:
+    def stop(self, reason: str, cause: StopCause) -> None:
         """Stop the robot at once and for a second, and end the lease."""
-        self.authority.stop(reason)
+        self.authority.stop(reason, cause)
         self.settle()
 
     def stop_commanded(self, sample: Sample) -> None:
@@ -182,9 +181,9 @@ class Enforcer:
         self.authority.latches.autonomous = True
         return self._save(self.authority.latches)
 
-    def require_neutral(self, reason: str, *, stops: bool) -> None:
+    def require_neutral(self, reason: str, cause: StopCause, *, stops: bool) -> None:
         """Allow no motion before a neutral drive; with ``stops`` the robot is sent its stop."""
-        self.authority.require_neutral(reason, stops=stops)
+        self.authority.require_neutral(reason, cause, stops=stops)
         self.settle()
 
     # What follows from a decision, and from time going by
@@ -207,7 +206,7 @@ class Enforcer:
         suspended_s = self._context.suspended_s()
         if suspended_s > self._suspended_s + SUSPENDED_S:
             asleep_s, self._suspended_s = suspended_s - self._suspended_s, suspended_s
-            self.stop(f"the gateway's machine was suspended for {asleep_s:.1f} s")
+            self.stop(f"the gateway's machine was suspended for {asleep_s:.1f} s", StopCause.SUSPENDED)
         if self._clock() >= self._timer_at:
             self._on_time()
 
@@ -216,7 +215,7 @@ class Enforcer:
         for command, limit in self.refusal_limits.items():
             for refusal, count in limit.dropped():
                 self.authority.refuse(command, refusal, count=count)
-                self._refused.value += count - 1  # settling counts one
+                self._counts.refused(refusal.code, count - 1)  # settling counts one
         self._same_stops.value = self.admission.same_stops
         self.lease_hook.repeat()
         self.settle()
@@ -242,13 +241,11 @@ class Enforcer:
         changed = False
         while events := self.authority.events():
             for event in events:
-                if event.what is EventKind.REFUSED:
-                    self._refused.value += 1
-                else:
+                self._counts.note(event)
+                if event.what is not EventKind.REFUSED:
                     changed = True
                     if event.what is not EventKind.ACQUIRED and self._limits is not None:
                         self._limits.stopped()
-                    self._context.metrics.count("control", what=event.what.value).value += 1
                 if event.stops:
                     self._send_stop()
                 if event.what in (EventKind.LATCHED, EventKind.UNLATCHED):

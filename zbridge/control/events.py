@@ -44,6 +44,47 @@ class AuthorityInput(StrEnum):
     BUS_LOST = "bus lost"
 
 
+class StopCause(StrEnum):
+    """What stops a robot, for programs; the reason says more to people."""
+
+    COMMAND = "command"
+    """Somebody's stop."""
+    LATCH = "latch"
+    """A latched stop came into force."""
+    DEADMAN = "deadman"
+    """Motion was not repeated in time."""
+    LEASE_EXPIRED = "lease_expired"
+    """The holder did not renew its lease."""
+    HOLDER_LOST = "holder_lost"
+    """The holder's liveliness token is gone."""
+    BUS_LOST = "bus_lost"
+    """No other process can be reached."""
+    RELEASED = "released"
+    """The holder gave the lease back while the robot moved."""
+    TAKEN_OVER = "taken_over"
+    """Another program took the lease while the robot moved."""
+    UNDRIVEN = "undriven"
+    """It moved without a driver when a program acquired it."""
+    LINK_STALLED = "link_stalled"
+    """Its link had accepted no bytes."""
+    ROBOT_LOST = "robot_lost"
+    """Its connection ended."""
+    ROBOT_BUSY = "robot_busy"
+    """It accepts no commands, or has just begun to."""
+    LINK_IN_DOUBT = "link_in_doubt"
+    """Its connection may lose or alter what is sent."""
+    NOT_READY = "not_ready"
+    """Motion was refused because the robot was not ready."""
+    ANOTHER_GATEWAY = "another_gateway"
+    """It was left to another gateway, or taken back."""
+    RESTART = "restart"
+    """The gateway hands over to its successor."""
+    GATEWAY_ENDING = "gateway_ending"
+    """The gateway takes leave of the robot."""
+    SUSPENDED = "suspended"
+    """The gateway's machine slept."""
+
+
 class EventKind(Enum):
     """What happened to the right to drive."""
 
@@ -62,7 +103,7 @@ class Cause(msgspec.Struct, frozen=True):
 
     at: when it happened, or when a command was given. received_ms: the gateway's raw clock. request: for the lease.
     shown, key: the proof of a question about the lease, and the key that was queried. kind, reason, who: of the event
-    that follows. stops: whether the robot is sent its stop where neutral is required.
+    that follows. stops: whether the robot is sent its stop where neutral is required. stop: the cause of a stop.
     """
 
     at: float = math.inf
@@ -74,6 +115,7 @@ class Cause(msgspec.Struct, frozen=True):
     reason: str = ""
     who: str | None = None
     stops: bool = True
+    stop: StopCause = StopCause.COMMAND
 
 
 class CommandSender(msgspec.Struct, frozen=True):
@@ -90,7 +132,7 @@ class CommandSender(msgspec.Struct, frozen=True):
 
 
 class AuthorityEvent(msgspec.Struct, frozen=True):
-    """One event to write down. stops: whether the robot must be sent its stop now."""
+    """One event to write down. stops: whether the robot must be sent its stop now. cause: of an event that stops it."""
 
     what: EventKind
     who: str | None = None
@@ -99,6 +141,7 @@ class AuthorityEvent(msgspec.Struct, frozen=True):
     command: str | None = None
     code: Code | None = None
     stops: bool = False
+    cause: StopCause | None = None
 
     def __str__(self) -> str:
         who = f" {self.who}" if self.who else ""

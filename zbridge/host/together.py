@@ -18,9 +18,9 @@ from collections.abc import Callable, Coroutine, Mapping
 from typing import Any
 
 from zbridge.app.config import GatewayPlan
-from zbridge.app.gateway import Gateway, Neighbourhood
+from zbridge.app.endpoint import serve_metrics
+from zbridge.app.gateway import Gateway, Neighbourhood, robot_metrics
 from zbridge.app.joining import SessionUseless, can_connect, join_bus, watch_certificate, watch_session
-from zbridge.app.prometheus import serve_metrics
 from zbridge.bus import Bus
 from zbridge.bus.tls.files import own_certificate
 from zbridge.control.context import Conditions
@@ -58,7 +58,7 @@ class Together:
         self._host = host
         self._hold = hold
         self._bus: Bus | None = None
-        self._failed = self.metrics.count("gateways_failed")
+        self._failed = self.metrics.count("gateway_failures")
         self._neighbourhood = Neighbourhood(host.share, bytearray(SHARED_READ_BYTES))
         self._tasks: dict[str, asyncio.Task[None]] = {}
 
@@ -120,7 +120,7 @@ class Together:
     async def _keep_running(self, name: str, plan: GatewayPlan, after_s: float) -> None:
         """Run a gateway, and again after it failed, until cancelled."""
         await asyncio.sleep(after_s)
-        backoff, metrics = Backoff(FIRST_PAUSE_S, LONGEST_PAUSE_S), self.metrics.labelled(robot=plan.config.robot.name)
+        backoff, metrics = Backoff(FIRST_PAUSE_S, LONGEST_PAUSE_S), robot_metrics(plan, self.metrics)
         while True:
             begun = time.monotonic()
             try:

@@ -279,7 +279,7 @@ class Client:
         hooks = ConversationHooks(
             deliver=self._on_messages,
             changed=self._on_session,
-            malformed=context.counts.malformed,
+            malformed=context.counts.malformed_frames,
             foreign=context.counts.foreign_datagrams,
             rivals=context.counts.rival_sources,
             refused=lambda refusal: self._refuse(topics.CMD_DRIVE, refusal),

@@ -36,7 +36,7 @@ class Bridge(CommandPublishers):
 
 
 class ListenerCounts(msgspec.Struct, frozen=True):
-    """The counters of one listener (metrics ``hq_<field>``, labelled with its name)."""
+    """The counters of one listener: metrics ``hq_<field>``, but for the connections."""
 
     accepted: Count
     turned_away: Count
@@ -44,7 +44,7 @@ class ListenerCounts(msgspec.Struct, frozen=True):
     left_out: Count
     commands: Count
     refused: Count
-    malformed: Count
+    malformed_frames: Count
     foreign_datagrams: Count
     rival_sources: Count
     refusals_untold: Count
@@ -73,8 +73,14 @@ class ListenerContext(msgspec.Struct, frozen=True):
 
 
 def listener_counts(metrics: Metrics, name: str) -> ListenerCounts:
-    """Return the counters of the listener of this name; made on first use."""
-    return ListenerCounts(**{field: metrics.count(f"hq_{field}", listener=name) for field in _COUNTS})
+    """Return the counters of a listener; made on first use. name: the same after every start of the process."""
+    connections = {outcome: metrics.count("hq_connections", listener=name, outcome=outcome) for outcome in _CONNECTIONS}
+    others = {
+        field: metrics.count(f"hq_{field}", listener=name)
+        for field in ListenerCounts.__struct_fields__
+        if field not in connections
+    }
+    return ListenerCounts(**connections, **others)
 
 
-_COUNTS = ListenerCounts.__struct_fields__
+_CONNECTIONS = ("accepted", "turned_away")

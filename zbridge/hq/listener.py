@@ -123,7 +123,8 @@ class Listener:
 
     def _make_context(self, plan: ListenerPlan, robot: RobotSubscription, metrics: Metrics) -> ListenerContext:
         assert plan.protocol.hq is not None
-        tasks, counts = Tasks(), listener_counts(metrics, self.name)
+        label = plan.settings.name or f"{plan.protocol.name}:{plan.address.port}"
+        tasks, counts = Tasks(), listener_counts(metrics, label)
         return ListenerContext(
             name=self.name,
             settings=plan.settings,

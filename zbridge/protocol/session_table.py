@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from typing import Any, ClassVar
+
+import msgspec
 
 from zbridge.fleet.processes import SessionEntry
 from zbridge.protocol.kept import Kept
-from zbridge.protocol.session import Session
+from zbridge.protocol.session import Role, Session
+from zbridge.protocol.traffic import Traffic
 
 REMEMBERED = 32
 """Ended sessions that the table shows."""
@@ -78,6 +81,8 @@ class SessionTable:
     def __init__(self) -> None:
         self._live: dict[Session[Any], None] = {}
         self._ended: list[SessionEntry] = []
+        self._past: dict[Role, Traffic] = {role: Traffic() for role in Role}
+        """What sessions carried that have ended."""
 
     def __repr__(self) -> str:
         return f"<SessionTable {len(self._live)} live, {len(self._ended)} ended>"
@@ -91,7 +96,25 @@ class SessionTable:
         if session in self._live:
             del self._live[session]
             self._ended = [*self._ended, session.snapshot()][-REMEMBERED:]
+            _add(self._past[session.role], session.traffic)
+
+    def __iter__(self) -> Iterator[Session[Any]]:
+        """Go through the live ones."""
+        return iter(self._live)
+
+    def carried(self, role: Role) -> Traffic:
+        """Sum what all sessions of one role have carried, also those that have ended."""
+        total = msgspec.structs.replace(self._past[role])
+        for session in self._live:
+            if session.role is role:
+                _add(total, session.traffic)
+        return total
 
     def snapshots(self) -> tuple[SessionEntry, ...]:
         """Show every session, the live ones first."""
         return (*(session.snapshot() for session in self._live), *self._ended)
+
+
+def _add(total: Traffic, more: Traffic) -> None:
+    for field in Traffic.__struct_fields__:
+        setattr(total, field, getattr(total, field) + getattr(more, field))

@@ -5,19 +5,22 @@ A command that is refused is counted and shown on ``control``; none is dropped s
 
 from __future__ import annotations
 
+from functools import partial
+
 import msgspec
 
 from zbridge.bus import Sample
 from zbridge.control.admission import OF_THE_HOLDER, is_stop
 from zbridge.control.context import RobotContext
 from zbridge.control.enforcer import Enforcer
-from zbridge.control.events import CommandSender
+from zbridge.control.events import CommandSender, StopCause
 from zbridge.errors import Code, EncodeError, Malformed, NotReady, PayloadError, Refused, Unsupported, ZbridgeError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Mode, Motor, Raw
 from zbridge.fleet.topics import Delivery, Topic
 from zbridge.lease.proof import Verifier
+from zbridge.metrics import Count
 from zbridge.protocol.plugin import Outcome
 from zbridge.protocol.session import Session, State
 
@@ -54,7 +57,8 @@ class Commands:
         self.blocked = False
         """Whether the robot's link is stalled: drives are not written, all other commands are refused."""
         self._topics = {context.keys.key(topics.CMD_DRIVE.path): topics.CMD_DRIVE}
-        self._taken = context.metrics.count("commands")
+        self._counts: dict[str, tuple[Count, Count]] = {}
+        """Messages and bytes received, by kind."""
         self._unwritten = context.metrics.count("drives_unwritten")
 
     def __repr__(self) -> str:
@@ -62,21 +66,24 @@ class Commands:
 
     def take(self, sample: Sample) -> None:
         """Carry out one command, or refuse it and show the refusal on ``control``."""
-        self._taken.value += 1
         self._enforcer.keep_time()
-        sender = None
+        sender = topic = None
         try:
             topic = self._topics.get(sample.key)
             if topic is None:
                 if is_stop(sample.key):  # of anybody, with any payload
+                    self._count("stop", sample)
                     self._enforcer.stop_commanded(sample)
                     return
                 topic = self._find(sample.key)
+            self._count(topic.path.split("/", 2)[1], sample)
             now = self._clock()
             if topic.message in OF_THE_HOLDER:
                 sender = self._enforcer.admit(sample, now)
             self._carry_out(topic, sample.payload, now, sender)
         except (Refused, PayloadError, EncodeError) as error:
+            if topic is None:
+                self._count("unknown", sample)
             self._refuse(sample.key.rpartition("@cmd/")[2], error, sender)
         self._enforcer.settle()
 
@@ -97,6 +104,14 @@ class Commands:
     def refuse_all(self, reason: str | None) -> None:
         """Take nothing but stops from now on; None: take commands again."""
         self._closing, self._awaiting = reason, None
+
+    def _count(self, kind: str, sample: Sample) -> None:
+        counts = self._counts.get(kind)
+        if counts is None:
+            count = partial(self._context.metrics.count, direction="in", kind=kind)
+            counts = self._counts[kind] = (count("bus_messages"), count("bus_bytes"))
+        counts[0].value += 1
+        counts[1].value += len(sample.payload)
 
     def _refuse(self, command: str, error: ZbridgeError, sender: CommandSender | None) -> None:
         refused = error if isinstance(error, Refused) else Malformed(str(error))
@@ -170,7 +185,7 @@ class Commands:
                 _require_sure(session)
         except Refused as refusal:
             if moving:
-                self._enforcer.require_neutral(str(refusal), stops=False)
+                self._enforcer.require_neutral(str(refusal), StopCause.NOT_READY, stops=False)
             raise
         if moving:
             permitted = self._enforcer.permit(command, now)

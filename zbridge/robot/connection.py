@@ -67,6 +67,8 @@ class LinkHooks(msgspec.Struct, frozen=True):
     """``session(name, address)``: makes the session of a new connection."""
     session_changed: Callable[[Session[Any]], None]
     state_changed: Callable[[], None]
+    connected: Callable[[str, str], object]
+    """``connected(name, outcome)``: a connection was established, or has failed before that, or was lost after it."""
     stalled: Callable[[str, bool], object]
     linked: Callable[[str, Link, bool], object]
     read: Callable[[str, Resume], object] | None
@@ -151,6 +153,7 @@ class Connection:
         backoff = Backoff(chance=self._settings.chance)
         while not self._ending:
             reason, established = await self._converse()
+            self._hooks.connected(self.name, "lost" if established else "failed")
             if established:
                 backoff.reset()
             if self._ending:
@@ -287,6 +290,7 @@ class Connection:
 
     def _on_session(self, session: Session[Any]) -> None:
         if session.state is State.ESTABLISHED and self.state != "established":
+            self._hooks.connected(self.name, "established")
             agreed = [f"version {session.version}"] if session.version else []
             agreed += [f"features {', '.join(session.features)}"] if session.features else []
             log.info("%s: %s", self._label, ", ".join(["established", *agreed]))

@@ -19,6 +19,7 @@ from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
 from zbridge.control.context import RobotContext
 from zbridge.control.enforcer import Enforcer, Save
+from zbridge.control.events import StopCause
 from zbridge.control.lease_server import LeaseServer
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import IDLE_STOP_S, STOP_REPEAT_S, Standstill
@@ -121,19 +122,14 @@ class RobotDevice(Transferable):
             before=self.enforcer.keep_time,
             clock=context.clock,
             share=settings.share,
-            malformed=context.metrics.count("malformed"),
+            times=context.metrics.histogram("socket_to_bus_seconds"),
+            malformed=context.metrics.count("malformed_frames"),
             foreign=context.metrics.count("foreign_datagrams"),
-            surplus=context.metrics.count("datagrams_over_share"),
+            surplus=context.metrics.count("surplus_datagrams"),
         )
-        return LinkHooks(
-            self._session,
-            presence.session_changed,
-            presence.state_changed,
-            presence.stalled,
-            self._observer.linked,
-            observer.read if observer is not None else None,
-            conversation,
-        )
+        read = observer.read if observer is not None else None
+        changes = (presence.session_changed, presence.state_changed, presence.count_connection, presence.stalled)
+        return LinkHooks(self._session, *changes, self._observer.linked, read, conversation)
 
     def __repr__(self) -> str:
         return f"<RobotDevice {self._context.keys.robot} {self.observed.state}>"
@@ -241,7 +237,7 @@ class RobotDevice(Transferable):
         if self.observed.aside:  # as the process before this one
             return
         self._refuse_all(_ASIDE)
-        self.enforcer.stop(_ASIDE)
+        self.enforcer.stop(_ASIDE, StopCause.ANOTHER_GATEWAY)
         self.enforcer.beat()
         self._pending.refuse_all(_ASIDE)
         self.observed.aside = True
@@ -267,7 +263,7 @@ class RobotDevice(Transferable):
         self._refuse_all(None)
         self._latch_news.returned()
         self._standstill.begin()
-        self.enforcer.stop("served again")
+        self.enforcer.stop("served again", StopCause.ANOTHER_GATEWAY)
         self._show()
         self._observer.changed()
 
@@ -288,7 +284,7 @@ class RobotDevice(Transferable):
             raise Unsupported(f"protocol {self._protocol} does not hand its sessions over")
         self._refuse_all(reason)
         driven = self.enforcer.authority.motion.driven
-        self.enforcer.stop(reason)
+        self.enforcer.stop(reason, StopCause.RESTART)
         self._context.pump()
         until = self._context.clock() + within_s
         if driven and math.isfinite(often_s := self._context.robot.idle_stop_s):
@@ -383,7 +379,7 @@ class RobotDevice(Transferable):
         self._presence.leave()
         self._refuse_all(_LEAVING)
         if self.enforcer.authority.motion.moving:
-            self.enforcer.stop(_LEAVING)
+            self.enforcer.stop(_LEAVING, StopCause.GATEWAY_ENDING)
         self.enforcer.lease_hook.leave()
         await asyncio.sleep(min(self._standstill.stopping_s, STOP_REPEAT_S))
         await asyncio.gather(*(connection.close(_LEAVING, LEAVE_S) for connection in self._links))

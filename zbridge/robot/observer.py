@@ -66,6 +66,12 @@ class ObservedRobot:
         """The state of the robot, as on ``status``."""
         return self._links.first.state
 
+    @property
+    def stalled(self) -> bool:
+        """Whether the robot's link accepts no bytes."""
+        conversation = self._links.first.conversation
+        return conversation is not None and conversation.blocked
+
     def last_stop(self) -> LastStop:
         """Return what stops the robot now; see :class:`LastStop`."""
         context, driven, state = self._context, self.driven, self.state

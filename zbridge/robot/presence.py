@@ -11,6 +11,7 @@ from msgspec import UNSET
 
 from zbridge.control.context import RobotContext
 from zbridge.control.enforcer import Enforcer
+from zbridge.control.events import StopCause
 from zbridge.control.standstill import Standstill
 from zbridge.errors import Refused
 from zbridge.fleet import topics
@@ -77,11 +78,15 @@ class Presence:
         elif session.state is State.ESTABLISHED and session is not self._greeted:
             self._on_established(session)
         elif busy != self._busy:
-            self._enforcer.require_neutral(self._busy or "no longer busy", stops=True)
+            self._enforcer.require_neutral(self._busy or "no longer busy", StopCause.ROBOT_BUSY, stops=True)
         if self._doubtful and not doubtful:
-            self._enforcer.require_neutral(self._doubtful, stops=True)
+            self._enforcer.require_neutral(self._doubtful, StopCause.LINK_IN_DOUBT, stops=True)
         if session.doubts != self._shown_doubts and not session.over and self._links.first.state == "established":
             self.publish_status()
+
+    def count_connection(self, link: str, outcome: str) -> None:
+        """Count a connection that was established, failed before that, or was lost after it."""
+        self._context.metrics.count("robot_connections", link=link, outcome=outcome).value += 1
 
     def stalled(self, name: str, stalled: bool) -> None:
         """Drive no robot whose first link is stalled: it would obey late, or lose its stop with the rest."""
@@ -93,7 +98,7 @@ class Presence:
             self._stalls.value += 1
             log.warning("%s: %s", self._context.keys.robot, LINK_BLOCKED)
         else:
-            self._enforcer.require_neutral("the robot's link stalled", stops=True)
+            self._enforcer.require_neutral("the robot's link stalled", StopCause.LINK_STALLED, stops=True)
 
     def state_changed(self) -> None:
         """Show the new state of a link."""
@@ -130,7 +135,7 @@ class Presence:
         if session.version is not None:
             self._lost.value += len(session.outbox)
             if not self._leaving:
-                self._enforcer.require_neutral("robot lost", stops=False)
+                self._enforcer.require_neutral("robot lost", StopCause.ROBOT_LOST, stops=False)
             self._pending.refuse_all("the robot was lost")
 
     def _on_established(self, session: Session[Any]) -> None:

@@ -9,6 +9,7 @@ stream drops the oldest, and a lossless bus asks to pause: then the links read n
 from __future__ import annotations
 
 import logging
+from functools import partial
 from typing import Any
 
 from zbridge.bus import Publisher
@@ -44,9 +45,9 @@ class Telemetry:
         self._pending = pending
         self._links = links
         self._translators: dict[type, Translate] = {}
-        self._published: dict[str, Count] = {}
-        """By path; the paths of a family share a counter."""
-        self._untranslatable = context.metrics.count("untranslatable")
+        self._counts: dict[str, tuple[Count, Count]] = {}
+        """Messages and bytes published, by path; the paths of a family share their counters."""
+        self._untranslatable = context.metrics.count("untranslatable_messages")
         self._unnamed = context.metrics.count("names_dropped")
 
     def __repr__(self) -> str:
@@ -93,24 +94,28 @@ class Telemetry:
                         streams[topic.path] = [payload]
                     else:
                         flowing = publisher.put(payload) and flowing
-                        self._count(topic.path, 1)
+                        messages_out, bytes_out = self._counts.get(topic.path) or self._counted(topic.path)
+                        messages_out.value += 1
+                        bytes_out.value += len(payload)
                     if waiting:
                         self._pending.answer(topic, payload)
             except ProtocolError as error:
                 self._untranslatable.value += 1
                 log.debug("%s: %s", self._context.keys.robot, error)
         for path, stream in streams.items():
-            self._count(path, len(stream))
+            messages_out, bytes_out = self._counts.get(path) or self._counted(path)
+            messages_out.value += len(stream)
+            bytes_out.value += len(stream[0]) if len(stream) == 1 else sum(map(len, stream))
         if streams and not publishers.muted:
             flowing = self._bus.put_all([(known[path], stream) for path, stream in streams.items()]) and flowing
         if not flowing:
             self._links.pause_reading()
 
-    def _count(self, path: str, messages: int) -> None:
-        count = self._published.get(path)
-        if count is None:
-            count = self._published[path] = self._context.metrics.count("published", key=path.partition("/")[0])
-        count.value += messages
+    def _counted(self, path: str) -> tuple[Count, Count]:
+        metrics, kind = self._context.metrics, path.partition("/")[0]
+        count = partial(metrics.count, direction="out", kind=kind)
+        counts = self._counts[path] = (count("bus_messages"), count("bus_bytes"))
+        return counts
 
     def _translator(self, kind: type) -> Translate:
         translate = self._translators[kind] = self._context.robot.translator(kind)

@@ -25,7 +25,7 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 import msgspec
 
 from zbridge.errors import FAULT, Refused, describe
-from zbridge.metrics import Count
+from zbridge.metrics import Count, Histogram
 from zbridge.protocol.kept import Budget, Exported
 from zbridge.protocol.session import Datagram, Session, State
 from zbridge.transport.link import STALLED_S, Link, Receiver
@@ -40,6 +40,8 @@ CATCH_UP_S = 0.05
 """Seconds for which such a process reads before it runs the session's timers."""
 CHECK_S = 0.05
 """Seconds between two checks of a stalled link."""
+_TIMED = 0b111
+"""Reads are timed whose number has none of these bits."""
 _ESTABLISHED, _CLOSED = State.ESTABLISHED, State.CLOSED
 
 _C = TypeVar("_C", bound="Conversation")
@@ -69,6 +71,8 @@ class ConversationHooks(msgspec.Struct, frozen=True, kw_only=True):
     """Seconds on the loop's time line; by default the loop's own clock, which may be a millisecond behind."""
     share: FairShare | None = None
     """Of a processor; a peer that sends more than can be processed within it is not read meanwhile."""
+    times: Histogram | None = None
+    """Of one read of eight, from the read until its messages are handed on."""
     malformed: Count = msgspec.field(default_factory=Count)
     foreign: Count = msgspec.field(default_factory=Count)
     rivals: Count = msgspec.field(default_factory=Count)
@@ -105,6 +109,7 @@ class Conversation(Receiver):
         self._hooks = hooks
         self._clock = clock = hooks.clock or loop.time
         self._before, self._read = hooks.before, hooks.read
+        self._times, self._reads = hooks.times, 0
         self._observed: Link | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at: float | None = None
@@ -112,7 +117,7 @@ class Conversation(Receiver):
         """When the session's timers run again: the process was delayed, and reads first."""
         self._seen = (session.state, session.busy, session.doubts)
         self._malformed_logged = 0
-        self._blocked = False
+        self.blocked = False
         """Whether nothing is written because the link is stalled."""
         self.reading = ReadControl(loop, clock, hooks.share)
         self.reading.resumed = lambda: session.silence.restart(clock())
@@ -142,6 +147,10 @@ class Conversation(Receiver):
             if self._read is not None:
                 self._read()
             self._hand_on(messages)
+            if self._times is not None:
+                self._reads = reads = self._reads + 1
+                if not reads & _TIMED:
+                    self._times.observe(self._clock() - begun)
         except Exception as error:
             self._fault(error)
         else:
@@ -213,8 +222,8 @@ class Conversation(Receiver):
             at = self._reads_until if now < self._reads_until else session.deadline(writing=False)
             if writes_at is not None and (at is None or writes_at < at):
                 at = writes_at
-            if waited_s or self._blocked:
-                check_at = now + (CHECK_S if self._blocked else max(0.0, STALLED_S - waited_s) + CHECK_S / 10)
+            if waited_s or self.blocked:
+                check_at = now + (CHECK_S if self.blocked else max(0.0, STALLED_S - waited_s) + CHECK_S / 10)
                 at = check_at if at is None else min(at, check_at)
             self._set_timer(at)
         except Exception as error:
@@ -227,10 +236,10 @@ class Conversation(Receiver):
             return None, 0.0
         established, waited_s, writes_at = session.state is _ESTABLISHED, link.unacknowledged_s, None
         last_words = not established and session.over  # these leave a stalled link too
-        if not last_words and (waited_s > (0.0 if self._blocked else STALLED_S)) is not self._blocked:
-            self._blocked = not self._blocked
-            self._hooks.stalled(self._blocked)
-        if self._blocked and not last_words:
+        if not last_words and (waited_s > (0.0 if self.blocked else STALLED_S)) is not self.blocked:
+            self.blocked = not self.blocked
+            self._hooks.stalled(self.blocked)
+        if self.blocked and not last_words:
             return None, waited_s
         now = self._clock()
         while link.ready:

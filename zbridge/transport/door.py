@@ -126,12 +126,15 @@ async def make_link(sock: socket.socket, make: Callable[[], L]) -> L:
     return link
 
 
-async def waiting_sockets(address: Address) -> list[socket.socket]:
-    """Listen at every address of the host; raise OSError if one of them is not available."""
+async def waiting_sockets(address: Address, waiting: int = WAITING) -> list[socket.socket]:
+    """Listen at every address of the host; raise OSError if one of them is not available.
+
+    waiting: most clients that wait to be accepted.
+    """
     loop, sockets = asyncio.get_running_loop(), list[socket.socket]()
     try:
         for family, _, _, _, where in await loop.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM):
-            sockets.append(listening := socket.create_server(where, family=family, backlog=WAITING))
+            sockets.append(listening := socket.create_server(where, family=family, backlog=waiting))
             listening.setblocking(False)
     except OSError:
         for listening in sockets:

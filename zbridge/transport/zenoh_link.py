@@ -167,7 +167,7 @@ class ZenohLink(Link):
         if not self.ready:
             return
         self._timer = self._loop.call_later(REPORT_S, self._report)
-        lost = self._above + self._metrics.total("bus_in_dropped")
+        lost = self._above + self._metrics.total("bus_dropped", queue="bus_in")
         if lost > self._reported:
             count, self._reported = lost - self._reported, lost
             self._feed(dropped(count))

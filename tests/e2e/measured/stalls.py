@@ -35,7 +35,6 @@ import sys
 import tempfile
 import threading
 import time
-import urllib.request
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
@@ -51,6 +50,7 @@ from tests.e2e.rigs.moving_robot import REST_S, TOLERANCE, MovingRobot, waited
 from tests.e2e.rigs.processes import LINE_S, Part, Road, go_apart
 from tests.e2e.rigs.robots import SCALE
 from tests.ports import free_port
+from tests.scraped import scrape, totals
 
 LIMIT_S = 1.5
 """Most seconds from resuming to rest."""
@@ -67,8 +67,8 @@ PATIENCE_S = 4.0
 """Longest wait for rest, and for motion afterwards; after a cut twice its length more: kernels double their waits."""
 SHOWN_S = 2.0
 """The shortest cut that `status` and the counter must show."""
-LINK_STALLS = "zbridge_link_stalls_total"
-PUBLISHED = "zbridge_published_total"
+LINK_STALLS = "link_stalls"
+PUBLISHED = "bus_messages"
 KERNEL = (6, 15)
 """The first Linux with TCP_RTO_MAX_MS."""
 AGAIN_AT_MOST = 10
@@ -208,13 +208,8 @@ class Sitting:
     def _status(self) -> dict[str, Any]:
         return self._scene.fleet.last(f"{self._name}/status")
 
-    def _counters(self) -> list[str]:
-        """Read the gateway's counters, a line each."""
-        with urllib.request.urlopen(f"http://127.0.0.1:{self._metrics}/metrics", timeout=5) as page:
-            return [line for line in page.read().decode().splitlines() if not line.startswith("#")]
-
     def _count(self, name: str) -> int:
-        return sum(int(line.split()[-1]) for line in self._counters() if line.startswith(name))
+        return totals(scrape(self._metrics))[name]
 
     def _hear_again(self) -> None:
         """Wait until the robot's own bytes come through again: a second cut would double the wait of its kernel."""

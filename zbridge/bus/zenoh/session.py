@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, TypeVar
 
@@ -36,7 +36,7 @@ from zbridge.bus.zenoh.opening import in_short, open_or_explain
 from zbridge.bus.zenoh.publishers import Publishers
 from zbridge.errors import BusError
 from zbridge.fleet.topics import Topic
-from zbridge.metrics import Metrics
+from zbridge.metrics import Metrics, Reading
 from zbridge.tasks import occurs
 
 H = TypeVar("H", bound=Handle)
@@ -98,8 +98,8 @@ class ZenohBus:
         self._inboxes.append(self._inbox)
         self._answers = Answers(session)
         self._alive = AliveWatches(loop, partial(_declare_alive, session, self._inbox))
-        self._replies_dropped = metrics.count("bus_replies_dropped")
-        self._unanswered = metrics.count("bus_unanswered")
+        self._replies_dropped = metrics.count("bus_dropped", queue="replies")
+        self._unanswered = metrics.count("bus_queries_unanswered")
         self._relief: list[Callable[[], None]] = []
         self._writer = Writer("states", metrics, lossless=lossless, relieved=self._relieve)
         self._streams = Writer("streams", metrics, lossless=lossless, relieved=self._relieve)
@@ -107,6 +107,8 @@ class ZenohBus:
         self.put_all = self._publishers.put_all
         self._handles: list[Handle] = []
         self._tidy_at = _TIDY
+        self._unread = metrics.add_source(partial(_read_queues, self._inbox, self._writer, self._streams))
+        """Ends that the metrics show the queues."""
 
     def __repr__(self) -> str:
         return f"<ZenohBus {self._session.zid()}>"
@@ -230,6 +232,7 @@ class ZenohBus:
     async def close(self) -> bool:
         """Leave the bus within :data:`LEAVE_S`; False if that hangs, as with a router that has stalled."""
         handles, self._handles = self._handles, []
+        self._unread()
         if self._inbox in self._inboxes:
             self._inboxes.remove(self._inbox)
         left = threading.Event()
@@ -292,3 +295,9 @@ async def _written(writer: Writer) -> None:
 def _declare_alive(session: zenoh.Session, inbox: Inbox, key_expr: str, handler: Changed) -> Handle:
     store = priority_callback(PriorityClass.STOP, inbox.source(lambda change: handler(*change), read_change))
     return Declared(session.liveliness().declare_subscriber(key_expr, threadless(store), history=True))
+
+
+def _read_queues(inbox: Inbox, states: Writer, streams: Writer) -> Iterator[Reading]:
+    lengths = {"bus_in": inbox.length, "bus_out_states": states.length, "bus_out_streams": streams.length}
+    for queue, length in lengths.items():
+        yield "queue_length", {"queue": queue}, length

@@ -20,7 +20,7 @@ from websockets.http11 import Response
 from websockets.protocol import State
 from websockets.typing import Subprotocol
 
-from zbridge.app.prometheus import serve_metrics
+from zbridge.app.endpoint import serve_metrics
 from zbridge.bus import BusSettings, open_bus
 from zbridge.client import Fleet
 from zbridge.errors import ConfigError

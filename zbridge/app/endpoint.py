@@ -1,0 +1,295 @@
+"""Serves the metrics to Prometheus, and two probes: three pages over HTTP/1.0. Knows no bus and no robot.
+
+``/metrics``: the metrics. ``/healthz``: the process lives and its event loop turns. ``/readyz``: status 200 if the
+process is of use now, else 503 with the reasons, one a line.
+
+Theory of operation. Clients are accepted in batches with a pause between them, so that a flood takes a bounded part of
+the event loop's time. A client costs one descriptor and no task, and has :data:`REQUEST_S` to send its request. Where
+more than :data:`CLIENTS` are connected, the oldest client of the address that has most of them is closed: a thousand
+clients that say nothing keep no scrape waiting. What is no request is refused with its first bytes. All who ask for the
+metrics within :data:`FRESH_S` get the same text, which is written once.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import re
+import socket
+from collections import Counter
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from http import HTTPStatus
+
+from zbridge.metrics import Metrics
+from zbridge.metrics.exposition import CONTENT_TYPE
+from zbridge.protocol.address import Address
+from zbridge.tasks import Tasks
+from zbridge.transport.door import waiting_sockets
+
+log = logging.getLogger("zbridge.metrics")
+
+REQUEST_S = 2.0
+"""Longest time for a request, and for a client to read some of its answer."""
+CLIENTS = 256
+"""Clients at a time."""
+BATCH, PAUSE_S = 8, 0.005
+"""Clients that are accepted at once, and seconds to the next ones."""
+WAITING = 1024
+"""Most clients that wait in the kernel's queue."""
+FRESH_S = 0.1
+"""Seconds for which a text of the metrics is served again."""
+REQUEST_BYTES = 8192
+_LINE = re.compile(rb"(?P<method>[A-Z]{1,16}) (?P<path>/[!-~]{0,1024}) HTTP/1\.[0-9]\r?\n")
+_BEGINS = re.compile(rb"[A-Z]{1,16}(?: (?:/[!-~]*(?: [!-~]*\r?)?)?)?")
+"""What an unfinished first line may look like."""
+
+Missing = Callable[[], tuple[str, ...]]
+"""``missing()``: why the process is of no use now; nothing if it is."""
+Read = Callable[[], Awaitable[str]]
+"""``await read()``: the metrics, as text."""
+
+
+@contextlib.asynccontextmanager
+async def serve_metrics(
+    address: Address, metrics: Metrics | Read, missing: Missing = lambda: (), adopted: Sequence[socket.socket] = ()
+) -> AsyncIterator[list[socket.socket]]:
+    """Serve the three pages while the context lasts.
+
+    Gives the sockets at which it listens; ``adopted``: those of another process, in place of new ones. An address in
+    use is logged as an error and otherwise ignored.
+    """
+    try:
+        sockets = list(adopted) or await waiting_sockets(address, WAITING)
+    except OSError as error:
+        log.error("metrics endpoint %s: %s", address, error.strerror or error)
+        yield []
+        return
+    endpoint = MetricsServer(_of_process(metrics) if isinstance(metrics, Metrics) else metrics, missing)
+    for listening in sockets:
+        endpoint.listen(listening)
+    try:
+        yield sockets
+    finally:
+        await endpoint.close()
+        for listening in sockets:
+            listening.close()
+
+
+def _of_process(metrics: Metrics) -> Read:
+    async def read() -> str:
+        return metrics.exposition()
+
+    return read
+
+
+class MetricsServer:
+    """Accepts clients and answers them. read: gives the metrics. missing: why the process is not ready."""
+
+    def __init__(self, read: Read, missing: Missing) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._read = read
+        self._missing = missing
+        self._clients: dict[_Client, None] = {}
+        """Those that are connected, the oldest first."""
+        self._hosts = Counter[str]()
+        self._pauses: dict[socket.socket, asyncio.TimerHandle | None] = {}
+        """The sockets at which this endpoint listens, with the timer of a pause."""
+        self._sweep: asyncio.TimerHandle | None = None
+        self._text: asyncio.Task[bytes] | None = None
+        self._read_at = -FRESH_S
+        self._tasks = Tasks()
+
+    def __repr__(self) -> str:
+        return f"<MetricsServer of {len(self._clients)} clients>"
+
+    def listen(self, listening: socket.socket) -> None:
+        """Accept clients at a socket that does not block."""
+        self._pauses[listening] = None
+        self._loop.add_reader(listening, self._accept, listening)
+
+    async def close(self) -> None:
+        """Accept nobody, and close all clients."""
+        for listening, pause in self._pauses.items():
+            self._loop.remove_reader(listening)
+            if pause is not None:
+                pause.cancel()
+        for client in tuple(self._clients):
+            client.close()
+        if self._sweep is not None:
+            self._sweep.cancel()
+        if self._text is not None:
+            self._text.cancel()
+        await self._tasks.end()
+
+    def _accept(self, listening: socket.socket) -> None:
+        pause_s = PAUSE_S
+        for _ in range(BATCH):
+            try:
+                connection, (host, *_) = listening.accept()
+            except BlockingIOError:
+                return
+            except OSError as error:  # no descriptor left: an immediate retry would use up the processor
+                log.debug("metrics endpoint: %s", error)
+                pause_s = REQUEST_S
+                break
+            self._admit(connection, host)
+        self._loop.remove_reader(listening)
+        self._pauses[listening] = self._loop.call_later(pause_s, self.listen, listening)
+
+    def _admit(self, connection: socket.socket, host: str) -> None:
+        if len(self._clients) >= CLIENTS:
+            most, _ = self._hosts.most_common(1)[0]
+            next(client for client in self._clients if client.host == most).close()
+        connection.setblocking(False)
+        self._hosts[host] += 1
+        client = _Client(self._loop, connection, host, self)
+        self._clients[client] = None
+        client.begin()
+        if self._sweep is None:
+            self._sweep = self._loop.call_later(REQUEST_S, self._close_late)
+
+    def forget(self, client: _Client) -> None:
+        """Note that a client's connection is closed."""
+        del self._clients[client]
+        self._hosts -= Counter((client.host,))
+
+    def prolong(self, client: _Client) -> None:
+        """Give a client its time anew: it reads its answer."""
+        del self._clients[client]
+        client.since = self._loop.time()
+        self._clients[client] = None
+
+    def _close_late(self) -> None:
+        """Close the clients whose time is over, and set the timer for the oldest of the others."""
+        self._sweep, now = None, self._loop.time()
+        while self._clients:
+            oldest = next(iter(self._clients))
+            if now < oldest.since + REQUEST_S:
+                self._sweep = self._loop.call_at(oldest.since + REQUEST_S, self._close_late)
+                return
+            oldest.close()
+
+    def answer(self, client: _Client, path: str) -> None:
+        """Answer a request for a page, at once where that is possible."""
+        match path:
+            case "/metrics" | "/":
+                self._tasks.start(self._show_metrics(client))
+            case "/healthz":
+                client.send(HTTPStatus.OK, b"ok\n")
+            case "/readyz":
+                reasons = self._missing()
+                body = "".join(f"{reason}\n" for reason in reasons) or "ok\n"
+                client.send(HTTPStatus.SERVICE_UNAVAILABLE if reasons else HTTPStatus.OK, body.encode())
+            case _:
+                client.send(HTTPStatus.NOT_FOUND, b"see /metrics, /healthz, /readyz\n")
+
+    async def _show_metrics(self, client: _Client) -> None:
+        if self._text is None or (self._text.done() and self._loop.time() >= self._read_at + FRESH_S):
+            self._text = self._loop.create_task(self._write())
+        try:
+            body = await asyncio.shield(self._text)
+        except Exception:
+            log.exception("the metrics cannot be read")
+            client.send(HTTPStatus.INTERNAL_SERVER_ERROR, b"the metrics cannot be read: see the log\n")
+        else:
+            client.send(HTTPStatus.OK, body)
+
+    async def _write(self) -> bytes:
+        text = await self._read()
+        self._read_at = self._loop.time()
+        return text.encode()
+
+
+class _Client:
+    """One connection: reads a request, writes an answer, and closes. host: its address."""
+
+    def __init__(
+        self, loop: asyncio.AbstractEventLoop, connection: socket.socket, host: str, endpoint: MetricsServer
+    ) -> None:
+        self.host = host
+        self.since = loop.time()
+        self._loop = loop
+        self._connection = connection
+        self._endpoint = endpoint
+        self._request = b""
+        self._left = memoryview(b"")
+        """What is still to be sent."""
+        self._bodiless = False
+
+    def begin(self) -> None:
+        """Read what is there, and what comes."""
+        self._loop.add_reader(self._connection, self._receive)
+        self._receive()
+
+    def close(self) -> None:
+        """Close the connection; idempotent."""
+        if self._connection.fileno() >= 0:
+            self._loop.remove_reader(self._connection)
+            self._loop.remove_writer(self._connection)
+            self._connection.close()
+            self._endpoint.forget(self)
+
+    def send(self, status: HTTPStatus, body: bytes) -> None:
+        """Send an answer, and close the connection then; nothing happens once it is closed."""
+        if self._connection.fileno() < 0:
+            return
+        self._loop.remove_reader(self._connection)
+        self._left = memoryview(response(status, body, bodiless=self._bodiless))
+        self._loop.add_writer(self._connection, self._write)
+        self._write()
+
+    def _receive(self) -> None:
+        try:
+            data = self._connection.recv(REQUEST_BYTES)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self.close()
+            return
+        self._request += data
+        found = parse(self._request)
+        if isinstance(found, HTTPStatus):
+            self.send(found, f"{found.phrase}\n".encode())
+        elif found is not None:
+            self._loop.remove_reader(self._connection)
+            method, path = found
+            self._bodiless = method == "HEAD"
+            self._endpoint.answer(self, path)
+
+    def _write(self) -> None:
+        try:
+            while self._left:
+                self._left = self._left[self._connection.send(self._left) :]
+                self._endpoint.prolong(self)
+            self._connection.shutdown(socket.SHUT_WR)
+        except BlockingIOError:
+            return
+        except OSError:
+            pass
+        self.close()
+
+
+def parse(request: bytes) -> tuple[str, str] | HTTPStatus | None:
+    """Return method and path of a request, the status that refuses it, or None if its end is still missing."""
+    line = _LINE.match(request)
+    if line is None:
+        unfinished = b"\n" not in request and _BEGINS.fullmatch(request)
+        return None if unfinished and len(request) <= REQUEST_BYTES else HTTPStatus.BAD_REQUEST
+    method = line["method"].decode()
+    if method not in ("GET", "HEAD"):
+        return HTTPStatus.METHOD_NOT_ALLOWED
+    if b"\r\n\r\n" in request or b"\n\n" in request:
+        return method, line["path"].decode().partition("?")[0]
+    return None if len(request) <= REQUEST_BYTES else HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE
+
+
+def response(status: HTTPStatus, body: bytes, *, bodiless: bool = False) -> bytes:
+    """Write an answer. bodiless: to a request of HEAD."""
+    head = (
+        f"HTTP/1.0 {status.value} {status.phrase}\r\nContent-Type: {CONTENT_TYPE}\r\n"
+        f"Content-Length: {len(body)}\r\nConnection: close\r\n\r\n"
+    )
+    return head.encode() + (b"" if bodiless else body)

@@ -24,6 +24,7 @@ from tests.proofs import lease
 from zbridge.bus import Answer, Handle, Publisher, Sample
 from zbridge.client import Driver, Fleet, Robot
 from zbridge.client.driver import default_who
+from zbridge.control.events import StopCause
 from zbridge.errors import (
     BusError,
     BusRefused,
@@ -444,7 +445,7 @@ async def test_during_ends_where_the_lease_is_lost_or_its_commands_are_refused(e
     async with driving() as (world, drive):
         began = world.loop.time()
         refuse = functools.partial(setattr, world.machine, "refusal", REFUSED)
-        stop = functools.partial(world.gateway.enforcer.stop, "stop")
+        stop = functools.partial(world.gateway.enforcer.stop, "stop", StopCause.COMMAND)
         world.loop.call_later(1.0, stop if error is LeaseLost else refuse)
         with pytest.raises(error):
             await drive.during(10.0, forward=0.5)
@@ -488,7 +489,7 @@ async def test_a_neutral_hides_no_refusal_of_another_cause() -> None:
 async def test_a_loop_that_only_drives_hears_of_its_loss() -> None:
     """It never waits for anything but its own commands."""
     async with driving() as (world, drive):
-        world.loop.call_later(0.0, world.gateway.enforcer.stop, "stop")
+        world.loop.call_later(0.0, world.gateway.enforcer.stop, "stop", StopCause.COMMAND)
         with contextlib.suppress(LeaseLost):
             for _ in range(10):
                 await drive(forward=0.5)

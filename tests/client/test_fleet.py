@@ -17,6 +17,7 @@ from tests.fake_bus import FakeBus
 from zbridge.bus import Answer, IncomingQuery, Sample
 from zbridge.client import Fleet, Robot
 from zbridge.client.stops import CONFIRM_S, REPEAT_S
+from zbridge.control.events import StopCause
 from zbridge.errors import BusError, NotReady, PayloadError, Refused, Unsupported
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -211,7 +212,7 @@ async def test_a_stop_nobody_confirms_was_sent_many_times_and_says_so(shown: byt
 async def test_refusals_of_long_ago_or_of_a_listener_are_none_of_this_stop() -> None:
     world = World("r1")
     world.machine.unstoppable = "not now"
-    world.gateway.enforcer.stop("stop")
+    world.gateway.enforcer.stop("stop", StopCause.COMMAND)
     world.machine.unstoppable = None
     forged = NotReady("somebody said so")
     world.bus.subscribe(

@@ -10,6 +10,7 @@ import pytest
 
 from tests.client import World
 from zbridge.client.pilot import STALE_S, Pilot
+from zbridge.control.events import StopCause
 from zbridge.errors import LeaseLost, NeutralFirst, NotReady, RateLimited, ZbridgeError
 from zbridge.fleet.messages import Drive, Mode, Motor
 from zbridge.lease.stick import Stick, StickRules
@@ -172,7 +173,7 @@ async def test_a_lease_that_is_kept_outlasts_the_deadman_and_then_neutral_is_nee
 async def test_neutral_that_the_gateway_demands_is_demanded_of_the_stick(scene: Scene) -> None:
     scene.make(BY_HAND)
     await scene.held()
-    scene.world.gateway.enforcer.require_neutral("the link stalled", stops=True)
+    scene.world.gateway.enforcer.require_neutral("the link stalled", StopCause.LINK_STALLED, stops=True)
     scene.pilot.drive(SECOND)
     await asyncio.sleep(0.1)
     with pytest.raises(NeutralFirst, match="send a neutral drive first"):

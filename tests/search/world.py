@@ -19,7 +19,7 @@ import msgspec
 from zbridge.bus import Answer, PriorityClass
 from zbridge.control.admission import CommandFilter, QueryFilter
 from zbridge.control.authority import Authority
-from zbridge.control.events import AuthorityEvent, CommandSender, EventKind
+from zbridge.control.events import AuthorityEvent, CommandSender, EventKind, StopCause
 from zbridge.control.latch import Latches, read_stop
 from zbridge.errors import Code, NotReady, Refused, Stale
 from zbridge.fleet import payload as payloads
@@ -371,7 +371,7 @@ class World:
         if not stops:
             self.robot.rest()
         self.decisions.append(("neutral required", None))
-        self.authority.require_neutral("link", stops=stops)
+        self.authority.require_neutral("link", StopCause.LINK_STALLED, stops=stops)
         self.settle()
 
     def settle(self) -> None:

@@ -54,8 +54,8 @@ MUTANTS = (
         "deadman sends no stop",
         None,
         MACHINE,
-        "cause.reason, stops=cause.stops))\n        motion.require_neutral",
-        "cause.reason, stops=False))\n        motion.require_neutral",
+        "cause.reason, stops=cause.stops, cause=cause.stop))\n        motion.require_neutral",
+        "cause.reason, stops=False, cause=cause.stop))\n        motion.require_neutral",
     ),
     Mutant(
         "timer not armed",
@@ -83,7 +83,7 @@ MUTANTS = (
         "lease never expires",
         "bus",
         AUTHORITY,
-        'self.machine.handle(Input.EXPIRED, Cause(reason="lease expired"))',
+        'self.machine.handle(Input.EXPIRED, Cause(reason="lease expired", stop=StopCause.LEASE_EXPIRED))',
         "pass",
     ),
     Mutant(
@@ -238,8 +238,8 @@ MUTANTS = (
         "stalled link is written to",
         "situations",
         "zbridge/transport/conversation.py",
-        "(waited_s > (0.0 if self._blocked else STALLED_S)) is not self._blocked",
-        "self._blocked",
+        "(waited_s > (0.0 if self.blocked else STALLED_S)) is not self.blocked",
+        "self.blocked",
     ),
     Mutant(
         "drives wait for a stalled link for ever",

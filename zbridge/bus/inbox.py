@@ -34,8 +34,8 @@ QUEUE_BYTES = 4 * 2**20
 SHARES = {PriorityClass.STOP: 64, PriorityClass.LATCH: 64, PriorityClass.COMMAND: 128, PriorityClass.OTHER: 64}
 """Items of each priority class that one batch serves at most."""
 
-TIMED = frozenset({PriorityClass.STOP, PriorityClass.COMMAND})
-"""Priority classes of which is measured how long their items wait and are handled."""
+_OTHER = PriorityClass.OTHER
+"""Of all other classes is measured how long their items wait and are handled."""
 
 Handler = Callable[[Any], None]
 Read = Callable[[Any], Any]
@@ -148,7 +148,7 @@ class Source:
                 queue.forgotten += queue.items.popleft()[2]
             self._dropped.value += 1
         queue.added += size
-        queue.items.append((self, raw, size, time.monotonic() if priority in TIMED else 0.0))
+        queue.items.append((self, raw, size, 0.0 if priority is _OTHER else time.monotonic()))
         self._inbox.line_up(queue, priority)
 
     def fold(self, raw: Any, priority: PriorityClass) -> None:
@@ -157,7 +157,7 @@ class Source:
         if queue.items:
             self._folded.value += 1
         else:
-            queue.items.append((self, raw, 0, time.monotonic() if priority in TIMED else 0.0))
+            queue.items.append((self, raw, 0, 0.0 if priority is _OTHER else time.monotonic()))
         self._inbox.line_up(queue, priority)
 
 

@@ -87,7 +87,7 @@ GROUPS: dict[str, tuple[Family, ...]] = {
             "socket_to_bus_seconds",
             MetricKind.HISTOGRAM,
             "Time from reading the robot's socket until its messages are with Zenoh, or in the queue for it;"
-            " one read of eight.",
+            " 20 reads a second at most.",
         ),
         Family(
             "bus_to_socket_seconds",

@@ -18,7 +18,7 @@ from zbridge.errors import ProtocolError, Refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.topics import Delivery, Topic
-from zbridge.metrics import Count
+from zbridge.metrics import Count, Metrics
 from zbridge.protocol.plugin import Translate
 from zbridge.protocol.session import Datagram
 from zbridge.robot.connection import Connection, Links
@@ -30,6 +30,19 @@ log = logging.getLogger("zbridge.robot.telemetry")
 
 ATTEND_EVERY = 64
 """Messages of a read between two looks at the commands that wait."""
+
+
+class _Published(dict[str, tuple[Count, Count]]):
+    """Messages and bytes published, by path; the paths of a family share their counters."""
+
+    def __init__(self, metrics: Metrics) -> None:
+        super().__init__()
+        self._metrics = metrics
+
+    def __missing__(self, path: str) -> tuple[Count, Count]:
+        count = partial(self._metrics.count, direction="out", kind=path.partition("/")[0])
+        counts = self[path] = (count("bus_messages"), count("bus_bytes"))
+        return counts
 
 
 class Telemetry:
@@ -45,8 +58,7 @@ class Telemetry:
         self._pending = pending
         self._links = links
         self._translators: dict[type, Translate] = {}
-        self._counts: dict[str, tuple[Count, Count]] = {}
-        """Messages and bytes published, by path; the paths of a family share their counters."""
+        self._counts = _Published(context.metrics)
         self._untranslatable = context.metrics.count("untranslatable_messages")
         self._unnamed = context.metrics.count("names_dropped")
 
@@ -75,7 +87,7 @@ class Telemetry:
         """Publish what the robot sent; the newest wins where the bus is slower, unless it is told to block."""
         stamp_ns = self._clock_ns()
         encode, translators, waiting = payloads.encode, self._translators, self._pending.waiting
-        publishers, known = self._publishers, self._publishers.known
+        publishers, known, counts = self._publishers, self._publishers.known, self._counts
         streams: dict[str, list[bytes]] = {}
         flowing = True
         for number, message in enumerate(messages, 1):
@@ -94,7 +106,7 @@ class Telemetry:
                         streams[topic.path] = [payload]
                     else:
                         flowing = publisher.put(payload) and flowing
-                        messages_out, bytes_out = self._counts.get(topic.path) or self._counted(topic.path)
+                        messages_out, bytes_out = counts[topic.path]
                         messages_out.value += 1
                         bytes_out.value += len(payload)
                     if waiting:
@@ -102,20 +114,16 @@ class Telemetry:
             except ProtocolError as error:
                 self._untranslatable.value += 1
                 log.debug("%s: %s", self._context.keys.robot, error)
+        batch = []
         for path, stream in streams.items():
-            messages_out, bytes_out = self._counts.get(path) or self._counted(path)
+            batch.append((known[path], stream))
+            messages_out, bytes_out = counts[path]
             messages_out.value += len(stream)
             bytes_out.value += len(stream[0]) if len(stream) == 1 else sum(map(len, stream))
         if streams and not publishers.muted:
-            flowing = self._bus.put_all([(known[path], stream) for path, stream in streams.items()]) and flowing
+            flowing = self._bus.put_all(batch) and flowing
         if not flowing:
             self._links.pause_reading()
-
-    def _counted(self, path: str) -> tuple[Count, Count]:
-        metrics, kind = self._context.metrics, path.partition("/")[0]
-        count = partial(metrics.count, direction="out", kind=kind)
-        counts = self._counts[path] = (count("bus_messages"), count("bus_bytes"))
-        return counts
 
     def _translator(self, kind: type) -> Translate:
         translate = self._translators[kind] = self._context.robot.translator(kind)

@@ -40,8 +40,8 @@ CATCH_UP_S = 0.05
 """Seconds for which such a process reads before it runs the session's timers."""
 CHECK_S = 0.05
 """Seconds between two checks of a stalled link."""
-_TIMED = 0b111
-"""Reads are timed whose number has none of these bits."""
+TIMED_S = 0.05
+"""Least seconds between two reads of a link that are timed: timing each would cost as much as handling it."""
 _ESTABLISHED, _CLOSED = State.ESTABLISHED, State.CLOSED
 
 _C = TypeVar("_C", bound="Conversation")
@@ -72,7 +72,7 @@ class ConversationHooks(msgspec.Struct, frozen=True, kw_only=True):
     share: FairShare | None = None
     """Of a processor; a peer that sends more than can be processed within it is not read meanwhile."""
     times: Histogram | None = None
-    """Of one read of eight, from the read until its messages are handed on."""
+    """Of a read every TIMED_S, from the read until its messages are handed on."""
     malformed: Count = msgspec.field(default_factory=Count)
     foreign: Count = msgspec.field(default_factory=Count)
     rivals: Count = msgspec.field(default_factory=Count)
@@ -109,7 +109,8 @@ class Conversation(Receiver):
         self._hooks = hooks
         self._clock = clock = hooks.clock or loop.time
         self._before, self._read = hooks.before, hooks.read
-        self._times, self._reads = hooks.times, 0
+        self._timed_at = -math.inf if hooks.times is not None else math.inf
+        """When the next read is timed."""
         self._observed: Link | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at: float | None = None
@@ -147,10 +148,8 @@ class Conversation(Receiver):
             if self._read is not None:
                 self._read()
             self._hand_on(messages)
-            if self._times is not None:
-                self._reads = reads = self._reads + 1
-                if not reads & _TIMED:
-                    self._times.observe(self._clock() - begun)
+            if begun >= self._timed_at:
+                self._timed(begun)
         except Exception as error:
             self._fault(error)
         else:
@@ -184,6 +183,12 @@ class Conversation(Receiver):
         if count.bit_length() != logged.bit_length() and self._hooks.may_warn("warnings of malformed messages"):
             log.warning("%s: %d malformed so far, last: %s", self.session.name, count, self.session.last_malformed)
         self._malformed_logged = count
+
+    def _timed(self, begun: float) -> None:
+        """Note how long a read has taken so far."""
+        assert self._hooks.times is not None
+        self._hooks.times.observe(self._clock() - begun)
+        self._timed_at = begun + TIMED_S
 
     def _fault(self, error: Exception) -> None:
         """End the session, and log where the code of its protocol is wrong."""

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import signal
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from typing import Any, TypeVar
 
+from zbridge.log import Log
+
 T = TypeVar("T")
 
-log = logging.getLogger("zbridge.app")
+log = Log("zbridge.app")
 
 
 class Tasks:
@@ -45,7 +46,7 @@ class Tasks:
     def _done(self, task: asyncio.Task[None]) -> None:
         self.running.discard(task)
         if not task.cancelled() and (error := task.exception()) is not None:
-            log.error("%s", error, exc_info=error)
+            log.error("task_failed", "{error}", error=error, exc_info=error)
 
 
 async def together(*work: Coroutine[Any, Any, None], first: Callable[[], Awaitable[None]] | None = None) -> None:

@@ -11,7 +11,7 @@ from zbridge.bus import Neighbour, Tls
 from zbridge.errors import Refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.processes import Membership
-from zbridge.security.router import FOLD_S, KINDS, Router, ZenohWarnings, translate_log_line
+from zbridge.security.router import Router, log_zenoh_line, translate_log_line
 from zbridge.security.router_settings import RouterPlan, RouterSettings
 
 HINT = ". Hint: increase the system open file limit."
@@ -92,23 +92,7 @@ def test_any_other_line_keeps_its_level_and_loses_its_place_in_zenohs_source() -
     assert translate_log_line(HEAD + "Unable to open listener tcp/1: in use")[0] == logging.DEBUG
 
 
-def test_a_warning_that_repeats_is_logged_once_and_counted(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO)
-    now = 0.0
-    warnings = ZenohWarnings(lambda: now)
-    for _ in range(100):
-        warnings.take(HEAD + LINES[0][0])
-    now = FOLD_S
-    warnings.take(HEAD + LINES[0][0])
-    assert [record.getMessage().rpartition(", or a clock is wrong")[2] for record in caplog.records] == [
-        "",
-        " (99 times more since it was last logged)",
-    ]
-
-
-def test_warnings_without_end_fill_neither_memory_nor_log(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO)
-    warnings = ZenohWarnings(lambda: 0.0)
-    for number in range(10 * KINDS):
-        warnings.take(f"{HEAD}something new {number}")
-    assert len(caplog.records) == KINDS + 1
+def test_a_line_of_zenoh_is_an_event_whose_text_tells_repeated_ones_apart(caplog: pytest.LogCaptureFixture) -> None:
+    log_zenoh_line(HEAD + LINES[0][0])
+    (record,) = caplog.records
+    assert (record.__dict__["event"], record.__dict__["fields"]) == ("zenoh", {"warning": record.getMessage()})

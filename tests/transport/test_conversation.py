@@ -250,7 +250,7 @@ async def test_malformed_messages_are_counted_and_logged_ever_more_rarely(caplog
             up.conversation.received(b"\x01?")
     up.conversation.received(b"\x01a")
     assert count.value == 100
-    assert [record.args[1] for record in caplog.records if isinstance(record.args, tuple)] == [2, 4, 8, 16, 32, 64]
+    assert [record.__dict__["fields"]["count"] for record in caplog.records] == [2, 4, 8, 16, 32, 64]
     assert "what is ?" in caplog.text
 
 

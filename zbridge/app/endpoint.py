@@ -14,20 +14,20 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import re
 import socket
 from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from http import HTTPStatus
 
+from zbridge.log import Log
 from zbridge.metrics import Metrics
 from zbridge.metrics.exposition import CONTENT_TYPE
 from zbridge.protocol.address import Address
 from zbridge.tasks import Tasks
 from zbridge.transport.door import waiting_sockets
 
-log = logging.getLogger("zbridge.metrics")
+log = Log("zbridge.metrics")
 
 REQUEST_S = 2.0
 """Longest time for a request, and for a client to read some of its answer."""
@@ -62,7 +62,8 @@ async def serve_metrics(
     try:
         sockets = list(adopted) or await waiting_sockets(address, WAITING)
     except OSError as error:
-        log.error("metrics endpoint %s: %s", address, error.strerror or error)
+        reason = error.strerror or error
+        log.error("metrics_unavailable", "metrics endpoint {address}: {reason}", address=address, reason=reason)
         yield []
         return
     endpoint = MetricsServer(_of_process(metrics) if isinstance(metrics, Metrics) else metrics, missing)
@@ -130,7 +131,7 @@ class MetricsServer:
             except BlockingIOError:
                 return
             except OSError as error:  # no descriptor left: an immediate retry would use up the processor
-                log.debug("metrics endpoint: %s", error)
+                log.debug("metrics_accept_failed", "metrics endpoint: {error}", error=error)
                 pause_s = REQUEST_S
                 break
             self._admit(connection, host)
@@ -190,7 +191,7 @@ class MetricsServer:
         try:
             body = await asyncio.shield(self._text)
         except Exception:
-            log.exception("the metrics cannot be read")
+            log.exception("metrics_unreadable", "the metrics cannot be read")
             client.send(HTTPStatus.INTERNAL_SERVER_ERROR, b"the metrics cannot be read: see the log\n")
         else:
             client.send(HTTPStatus.OK, body)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import math
 import socket
 from collections.abc import Coroutine, Iterator
@@ -40,6 +39,7 @@ from zbridge.fleet.processes import Sessions
 from zbridge.fleet.topics import KeySpace
 from zbridge.hq import Listener, RobotSubscription
 from zbridge.hq.names import listener_names, process_name
+from zbridge.log import Log
 from zbridge.metrics import Metrics, Reading
 from zbridge.protocol.address import Address
 from zbridge.protocol.kept import Exported
@@ -53,7 +53,7 @@ from zbridge.tasks import together, until
 from zbridge.transport import Parcel, attach, connect
 from zbridge.transport.reading import FairShare
 
-log = logging.getLogger("zbridge.app.gateway")
+log = Log("zbridge.app.gateway")
 
 LINGER_S = 0.2
 """Seconds between a handover and the end of the bus session: closing it drops what Zenoh has not yet sent."""
@@ -135,7 +135,7 @@ class Gateway:
                     return
                 except SessionUseless as error:
                     self._incoming = ColdStart()
-                    log.error("%s", error)
+                    log.error("session_useless", "{reason}", reason=error)
                 except Exception as error:
                     if not self._incoming.begun.is_set():
                         self._incoming.fail(str(error) if isinstance(error, ZbridgeError) else describe(error))

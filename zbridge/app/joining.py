@@ -12,7 +12,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
-import logging
 import random
 from collections.abc import Awaitable, Callable
 from datetime import datetime
@@ -24,9 +23,10 @@ from zbridge.bus.tls.files import ends_soon, utc_now
 from zbridge.control.context import Conditions
 from zbridge.errors import BusError, BusRefused
 from zbridge.fleet import topics
+from zbridge.log import Log
 from zbridge.metrics import Metrics
 
-log = logging.getLogger("zbridge.app.gateway")
+log = Log("zbridge.app.gateway")
 
 RETRY_S = 1.0
 """Seconds between attempts to open the bus, while no router is there."""
@@ -106,7 +106,7 @@ async def join_bus(plan: GatewayPlan, metrics: Metrics) -> Bus:
         except BusError as error:
             within_s = min(2 * within_s, OPEN_MOST_S)
             pause = pauses.after(error)
-            log.warning("no bus: %s; next attempt in %.2g s", error, pause)
+            log.warning("no_bus", "no bus: {error}; next attempt in {delay_s:.2g} s", error=error, delay_s=pause)
             await asyncio.sleep(pause)
     raise AssertionError("the session retries forever")
 
@@ -167,7 +167,7 @@ async def watch_certificate(
         conditions.set(_CERTIFICATE, text)
         if text is not None and (text != logged or loop.time() - logged_at >= LOG_S):
             logged, logged_at = text, loop.time()
-            log.warning("%s", text)
+            log.warning("certificate_ends", "{reason}", reason=text)
         left_s = (certificate.ends - now()).total_seconds()
         if left_s <= 0 and not here:
             raise CertificateEnded(f"{text}; the bus is left")

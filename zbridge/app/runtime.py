@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import random
 import secrets
 from collections.abc import Awaitable, Callable, Iterator
@@ -22,8 +21,11 @@ from zbridge.bus import Bus
 from zbridge.clocks import Clocks
 from zbridge.control.audit_log import Audit, AuditFile
 from zbridge.control.context import Conditions
+from zbridge.log import Log
 from zbridge.metrics import Metrics
 from zbridge.transport.kernel import KERNEL, Kernel
+
+log = Log("zbridge.control.audit_log")
 
 
 class Runtime(Clocks, frozen=True):
@@ -53,7 +55,7 @@ def open_audit(plan: GatewayPlan, metrics: Metrics, conditions: Conditions) -> I
     """Open the audit log: the file that the configuration names, else the process's log at DEBUG."""
     control, name = plan.config.control, plan.config.robot.name
     if control.audit is None or plan.device is None:
-        yield Audit(name, logging.getLogger("zbridge.control.audit_log").debug)
+        yield Audit(name, lambda line: log.debug("audit", "{line}", line=line))
         return
     loop = asyncio.get_running_loop()
 

@@ -8,7 +8,6 @@ the session table, the answer to restarts.
 from __future__ import annotations
 
 import asyncio
-import logging
 import math
 import time
 from collections.abc import Awaitable, Callable, Coroutine, Iterable, Mapping
@@ -19,11 +18,12 @@ from zbridge.control.context import Conditions
 from zbridge.control.latch import LatchRecord
 from zbridge.control.latch_store import LatchStore
 from zbridge.errors import Held
+from zbridge.log import Log
 from zbridge.robot.claim import Claim, Standing
 from zbridge.robot.device import RobotDevice
 from zbridge.robot.ownership import Ownership
 
-log = logging.getLogger("zbridge.app.gateway")
+log = Log("zbridge.app.gateway")
 
 LOG_S = 60.0
 """Seconds between two log lines about other gateways that serve the same robot."""
@@ -162,7 +162,7 @@ class Serving:
         self._conditions.set(_RIVALS, text if claims else None)
         if claims and self._clock() - self._logged_at >= LOG_S:
             self._logged_at = self._clock()
-            log.error("%s: %s", self._robot, text)
+            log.error("robot_contested", "{robot}: {reason}", robot=self._robot, reason=text)
             for zid in zids[:_LISTED]:
                 self._device.enforcer.authority.refuse("claim", Held("this gateway serves the robot"), zid)
                 self._device.enforcer.settle()

@@ -16,16 +16,16 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import time
 from collections import deque
 from collections.abc import Callable
 from typing import Any
 
 from zbridge.bus.interface import PriorityClass
+from zbridge.log import Log
 from zbridge.metrics import Count, Histogram, Metrics
 
-log = logging.getLogger("zbridge.bus")
+log = Log("zbridge.bus")
 
 QUEUE = 4096
 """Items of one source and one priority class that may wait; one more drops the oldest."""
@@ -114,7 +114,7 @@ class Inbox:
         try:
             source.handler(raw if source.read is None else source.read(raw))
         except Exception:
-            log.exception("a handler failed")
+            log.exception("handler_failed", "a handler failed")
         if at:
             if self._handled is None:
                 self._handled = self._metrics.histogram("bus_to_socket_seconds")

@@ -12,15 +12,15 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import random
 from collections.abc import Callable
 
 from zbridge.bus.interface import Bus, Sample
 from zbridge.errors import BusError
 from zbridge.fleet.topics import gateways_of, of_robot, split_key
+from zbridge.log import Log
 
-log = logging.getLogger("zbridge.bus")
+log = Log("zbridge.bus")
 
 ASK_AFTER_S = (0.0, 0.1, 0.4, 1.5)
 """Seconds before each query."""
@@ -116,4 +116,4 @@ class LateJoin:
         try:
             self._handler(sample)
         except Exception:
-            log.exception("a handler failed")
+            log.exception("handler_failed", "a handler failed")

@@ -10,16 +10,16 @@ everything.
 
 from __future__ import annotations
 
-import logging
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
 from queue import SimpleQueue
 
+from zbridge.log import Log
 from zbridge.metrics import Metrics
 
-log = logging.getLogger("zbridge.bus")
+log = Log("zbridge.bus")
 
 BACKLOG = 4096
 """Most messages that wait: a message counts one, a state one more for every 256 bytes."""
@@ -158,7 +158,7 @@ class Writer:
             call()
         except Exception as error:
             self._dropped.value += size
-            log.debug("not written to the bus: %s", error)
+            log.debug("bus_write_failed", "not written to the bus: {error}", error=error)
 
     def _written(self, size: int) -> None:
         with self._lock:

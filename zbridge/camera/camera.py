@@ -8,7 +8,6 @@ fault is a condition that ``status`` shows while somebody watches. The camera ne
 from __future__ import annotations
 
 import asyncio
-import logging
 import time
 from collections.abc import Callable
 
@@ -25,11 +24,12 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Image
 from zbridge.fleet.topics import KeySpace
+from zbridge.log import Log
 from zbridge.metrics import Metrics
 from zbridge.protocol.session_table import Backoff
 from zbridge.tasks import race
 
-log = logging.getLogger("zbridge.camera")
+log = Log("zbridge.camera")
 
 STEADY_S = 10.0
 """A stream that lasted this long was good: the next attempt follows soon; seconds."""
@@ -102,23 +102,27 @@ class Camera:
             if self._loop.time() - begun >= STEADY_S:
                 backoff.reset()
             if reason is None:
-                log.info("camera %s: nobody watches", self._plan.source)
+                log.info("camera_idle", "camera {source}: nobody watches", source=self._plan.source)
                 continue
             self._failures.value += 1
             delay_s = backoff.delay_s()
-            log.info("camera %s: %s; next attempt in %.1f s", self._plan.source, reason, delay_s)
+            template = "camera {source}: {reason}; next attempt in {delay_s:.1f} s"
+            log.info("camera_lost", template, source=self._plan.source, reason=reason, delay_s=delay_s)
             self._conditions.set(_CONDITION, f"camera {self._plan.source}: {reason}")
             await asyncio.sleep(delay_s)
 
     async def _fetch(self) -> str | None:
         """Fetch until the stream ends; return why it ended. None: nobody watches any more."""
-        log.info("camera %s: connecting", self._plan.source)
+        log.info("camera_connecting", "camera {source}: connecting", source=self._plan.source)
         try:
             await race(fetch(self._plan.source, self._plan.settings.stall_s, self._receive), self.demand.end())
         except (LinkError, ProtocolError) as error:
             return str(error)
         except Exception as error:
-            log.error("camera %s: %s", self._plan.source, describe(error), exc_info=error)
+            reason = describe(error)
+            log.error(
+                "camera_fault", "camera {source}: {error}", source=self._plan.source, error=reason, exc_info=error
+            )
             return describe(error)
         return None
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import socket
 from collections.abc import Callable
 
@@ -20,6 +19,7 @@ from zbridge.camera.demand import Demand
 from zbridge.camera.mjpeg import MjpegPart, MjpegReader
 from zbridge.camera.settings import CameraPlan
 from zbridge.camera.upstream import explain
+from zbridge.log import Log
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.protocol.networks import is_among
@@ -61,7 +61,7 @@ class Latest:
         return self._shot
 
 
-log = logging.getLogger("zbridge.camera")
+log = Log("zbridge.camera")
 
 PATH = b"/stream.mjpg"
 REQUEST_S = 5.0
@@ -116,7 +116,8 @@ class Relay:
                 await asyncio.sleep(backoff.delay_s())
                 continue
             self._report(None)
-            log.info("camera: HQ programs find %s at %s", PATH.decode(), self._address)
+            template = "camera: HQ programs find {path} at {address}"
+            log.info("camera_relayed", template, path=PATH.decode(), address=self._address)
             try:
                 async with asyncio.TaskGroup() as tasks:
                     for listening in sockets:
@@ -132,7 +133,7 @@ class Relay:
             try:
                 client, peer = await loop.sock_accept(listening)
             except OSError as error:  # no descriptor left: an immediate retry would use up the processor
-                log.debug("camera relay: %s", error)
+                log.debug("camera_accept_failed", "camera relay: {error}", error=error)
                 await asyncio.sleep(1.0)
                 continue
             if len(self._clients) >= self._most or (self._allow and not is_among(peer[0], self._allow)):

@@ -12,7 +12,7 @@ from zbridge.app import until_signal
 from zbridge.bus import read_zenoh_log
 from zbridge.cli import run_loop
 from zbridge.errors import ConfigError
-from zbridge.security.router import Router, ZenohWarnings
+from zbridge.security.router import Router, log_zenoh_line
 from zbridge.security.router_settings import RouterSettings, load_router, nested, nftables, plan_router, zenoh_values
 from zbridge.toml import convert
 
@@ -50,5 +50,5 @@ def run_router(
         print(nftables(plan.settings), end="")  # noqa: T201
         return
     os.environ.setdefault("ZENOH_RUNTIME", RUNTIME)
-    read_zenoh_log(ZenohWarnings().take)
+    read_zenoh_log(log_zenoh_line)
     run_loop(until_signal(Router(plan).run()))

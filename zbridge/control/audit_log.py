@@ -15,7 +15,6 @@ gateway's status says so.
 from __future__ import annotations
 
 import errno
-import logging
 import os
 import queue
 import stat
@@ -30,9 +29,10 @@ import msgspec
 from zbridge.control.events import AuthorityEvent, EventKind
 from zbridge.errors import ConfigError
 from zbridge.fleet.printable import as_json
+from zbridge.log import Log
 from zbridge.metrics import Metrics
 
-log = logging.getLogger("zbridge.control")
+log = Log("zbridge.control")
 
 CLOSE_S = 1.0
 """Longest wait for the disk at the end, seconds; it is waited for twice."""
@@ -133,7 +133,16 @@ class Audit:
 
     def _line(self, event: AuthorityEvent, count: int) -> None:
         if event.what is not EventKind.REFUSED:
-            log.info("%s: %s%s", self._robot, event, f", {count} times" if count > 1 else "")
+            log.info(
+                "authority_changed",
+                "{robot}: {what}{times}",
+                robot=self._robot,
+                what=event,
+                times=f", {count} times" if count > 1 else "",
+                kind=event.what.value,
+                who=event.who,
+                count=count,
+            )
         fields = {
             "time": datetime.fromtimestamp(self._clock_ns() / 1e9, UTC).isoformat(timespec="milliseconds"),
             "robot": self._robot,
@@ -233,13 +242,14 @@ class AuditFile:
         if not self._failing:
             self._failing = True
             why = f"the audit log is not written: {error.strerror or error}"
-            log.error("%s (%s)", why, self._path)
+            log.error("audit_not_written", "{reason} ({file})", reason=why, file=self._path)
             self._tell(why)
 
     def _recover(self) -> None:
         if self._failing:
             self._failing = False
-            log.warning("the audit log is written again, %d lines were dropped (%s)", self._dropped.value, self._path)
+            text = "the audit log is written again, {dropped} lines were dropped ({file})"
+            log.warning("audit_written_again", text, dropped=self._dropped.value, file=self._path)
             self._tell(None)
 
 

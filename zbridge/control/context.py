@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Callable
 
@@ -13,10 +12,11 @@ from zbridge.clocks import raw_ms, suspended_s
 from zbridge.errors import FAULT, Unsupported, describe
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import KeySpace, Topic
+from zbridge.log import Log
 from zbridge.metrics import Metrics
 from zbridge.protocol.plugin import RobotSide
 
-log = logging.getLogger("zbridge.robot.commands")
+log = Log("zbridge.robot.commands")
 
 LOGGED = 16
 """Faults that are logged, each once."""
@@ -72,7 +72,10 @@ class Faults:
         fault = describe(error)
         if fault not in self._logged and len(self._logged) < LOGGED:
             self._logged.add(fault)
-            log.error("%s: %s: %s%s", self._robot, what, FAULT, fault, exc_info=error)
+            text = f"{FAULT}{fault}"
+            log.error(
+                "protocol_fault", "{robot}: {what}: {reason}", robot=self._robot, what=what, reason=text, exc_info=error
+            )
 
 
 class RobotContext(msgspec.Struct, frozen=True):

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import os
 import tempfile
 from collections.abc import Mapping
@@ -24,8 +23,9 @@ from zbridge.control.context import Conditions
 from zbridge.control.latch import Latches, LatchRecord
 from zbridge.fleet.messages import Latch
 from zbridge.fleet.topics import KeySpace
+from zbridge.log import Log
 
-log = logging.getLogger("zbridge.control.latch")
+log = Log("zbridge.control.latch")
 
 MOST_BYTES = 64 * 1024
 """A larger file was not written by a gateway."""
@@ -111,7 +111,7 @@ class LatchStore:
             return None
         except (OSError, ValueError, msgspec.MsgspecError) as error:
             reason = f"{path} cannot be read: {error}"
-            log.error("%s: the robot is latched", reason)
+            log.error("latch_file_unreadable", "{reason}: the robot is latched", reason=reason, file=path)
             return LatchRecord((Latch(os.urandom(16), "gateway", reason),))
         self.known.merge(record)
         return record
@@ -143,7 +143,7 @@ class LatchStore:
         self._written.pop(path, None)  # so that it is tried again
         text = f"latched stops do not survive a restart: {path}: {error.strerror or error}"
         if text not in self._conditions.texts:
-            log.error("%s", text)
+            log.error("latch_not_written", "{reason}", reason=text, file=path)
         self._conditions.set(_CONDITION, text)
 
 

@@ -6,6 +6,7 @@ What one client sends or fails to take costs the others nothing.
 from __future__ import annotations
 
 import asyncio
+import logging
 import math
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -20,10 +21,13 @@ from zbridge.hq.intent import Intent
 from zbridge.hq.operator import Operator
 from zbridge.hq.refusal_reports import RefusalReports
 from zbridge.hq.robot_queries import RobotQueries
+from zbridge.log import Log
 from zbridge.protocol.kept import Exported
 from zbridge.protocol.plugin import Send, Telemetry
 from zbridge.protocol.session import Session, State
 from zbridge.transport import ClientConversation, Conversation, ConversationHooks, Parcel
+
+log = Log("zbridge.hq")
 
 STALL_S = 5.0
 """Seconds without taking what is written after which a client is closed; seconds of taking it count against them."""
@@ -246,7 +250,15 @@ class Client:
         if self.session.state is State.ESTABLISHED and not self.begun:
             self.begun = True
             agreed = f", version {self.session.version}" if self.session.version else ""
-            self.log("established", "client %d established%s", self.number, agreed)
+            log.log(
+                self.level("established"),
+                "hq_established",
+                "{listener}: client {client} established{agreed}",
+                listener=context.name,
+                client=self.number,
+                agreed=agreed,
+                peer=self.session.peer,
+            )
             self.send(context.side.begin)
             missing = context.robot.view.missing
             if missing is not None:
@@ -254,9 +266,10 @@ class Client:
         elif self.session.over:
             self.operator.close()
 
-    def log(self, kind: str, text: str, *values: object) -> None:
-        """Log an event of this client, folded with those of the same kind and address."""
-        self._context.connections.note(self.host, kind, self._context.clock(), text, *values)
+    def level(self, kind: str) -> int:
+        """Return the level of an event of this client: INFO for the first of its kind and address in a second."""
+        first = self._context.connections.first(self.host, kind, self._context.clock())
+        return logging.INFO if first else logging.DEBUG
 
     def _make_operator(self) -> Operator:
         side = self._context.side

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 
 import msgspec
@@ -12,8 +11,9 @@ from zbridge.fleet.messages import Drive, FleetMessage, Mode, Motor
 from zbridge.fleet.topics import Topic
 from zbridge.hq.context import Bridge
 from zbridge.lease.lease_client import LeaseClient
+from zbridge.log import Log
 
-log = logging.getLogger("zbridge.hq")
+log = Log("zbridge.hq")
 
 WAITING = 64
 """Commands of one client that may wait for the bus besides motion; one more is refused."""
@@ -99,7 +99,7 @@ class CommandQueue:
         try:
             await self._bridge.bus.flush()
         except BusError as error:
-            log.warning("%s: %s", self._who, error)
+            log.warning("commands_not_flushed", "{session}: {error}", session=self._who, error=error)
         self._writing = False
         while self._waiting and not self._writing and self._lease.held:
             command = self._waiting.pop(0)

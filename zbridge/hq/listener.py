@@ -9,7 +9,6 @@ A freeze of the process takes the robot from every client. At the end every clie
 from __future__ import annotations
 
 import asyncio
-import logging
 from collections.abc import Awaitable, Callable
 from typing import Any
 
@@ -25,6 +24,7 @@ from zbridge.hq.refusal_reports import RefusalReports
 from zbridge.hq.robot_queries import RobotQueries
 from zbridge.hq.robot_subscription import RobotSubscription
 from zbridge.hq.settings import ListenerPlan
+from zbridge.log import Log
 from zbridge.metrics import Metrics
 from zbridge.protocol.kept import Exported
 from zbridge.protocol.plugin import ATTEND_S
@@ -34,7 +34,7 @@ from zbridge.tasks import Tasks
 from zbridge.transport import Accepted, Conversation, Door, Link, Parcel, Receiver, TlsLink, listen
 from zbridge.transport.kernel import KERNEL, Kernel
 
-log = logging.getLogger("zbridge.hq")
+log = Log("zbridge.hq")
 
 LEAVE_S = 0.7
 """Longest time that clients, and the robot's gateway, are given to learn that the listener ends."""
@@ -110,7 +110,8 @@ class Listener:
                 await begin()
                 self._context.freeze.begin(self._clock())
                 await self.handover.resume()
-            log.info("%s: HQ programs connect at %s", self.name, self.address)
+            template = "{listener}: HQ programs connect at {address}"
+            log.info("hq_listening", template, listener=self.name, address=self.address)
             self.ready.set()
             try:
                 await self._attend()
@@ -164,7 +165,8 @@ class Listener:
                     client.sweep()
 
     def _on_freeze(self, frozen_s: float) -> None:
-        log.warning("%s: frozen for %.1f s: every HQ program must send neutral first", self.name, frozen_s)
+        template = "{listener}: frozen for {frozen_s:.1f} s: every HQ program must send neutral first"
+        log.warning("listener_froze", template, listener=self.name, frozen_s=frozen_s)
         for client in tuple(self.clients.values()):
             client.let_go(FROZEN)
 
@@ -205,7 +207,9 @@ class Listener:
             return None
         client = self._add(number, host, session)
         context.counts.accepted.value += 1
-        client.log("connected", "%s connected as client %d", link.peer, number)
+        template = "{listener}: {peer} connected as client {client}"
+        level = client.level("connected")
+        log.log(level, "hq_connected", template, listener=self.name, peer=link.peer, client=number)
         return client.conversation
 
     def _add(self, number: int, host: str, session: Session[Any]) -> Client:
@@ -221,7 +225,14 @@ class Listener:
         count = self._context.counts.turned_away
         count.value += 1
         if self._context.connections.first(host, f"turned away: {reason}", self._clock()):
-            log.warning("%s: %s turned away (%d so far): %s", self.name, link.peer, count.value, reason)
+            log.warning(
+                "hq_turned_away",
+                "{listener}: {peer} turned away ({count} so far): {reason}",
+                listener=self.name,
+                peer=link.peer,
+                count=count.value,
+                reason=reason,
+            )
 
     def _on_spoken(self, client: Client) -> None:
         if client.operator.active:
@@ -236,4 +247,12 @@ class Listener:
         self._numbers.release(client.number, self._clock(), rests=client.session.traffic.frames_in > 0)
         self._sessions.remove(client.session)
         self._broadcast.follow_wanted()
-        client.log("gone", "client %d gone: %s", client.number, client.session.reason)
+        log.log(
+            client.level("gone"),
+            "hq_gone",
+            "{listener}: client {client} gone: {reason}",
+            listener=self.name,
+            client=client.number,
+            reason=client.session.reason,
+            peer=client.session.peer,
+        )

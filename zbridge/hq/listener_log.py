@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import logging
 import math
 
 import msgspec
 
 from zbridge.errors import EncodeError, ProtocolError
+from zbridge.log import Log
 from zbridge.metrics import Count
 
-log = logging.getLogger("zbridge.hq")
+log = Log("zbridge.hq")
 
 ADDRESSES = 64
 """Addresses that have lines of their own within a second; all others share theirs."""
@@ -55,17 +55,13 @@ class ConnectionLog:
         fold.logged.add(kind)
         return True
 
-    def note(self, host: str, kind: str, now: float, text: str, *values: object) -> None:
-        """Log one event."""
-        level = logging.INFO if self.first(host, kind, now) else logging.DEBUG
-        log.log(level, f"%s: {text}", self._name, *values)
-
     def flush(self, now: float = math.inf) -> None:
         """Log a line for each address whose second is over and that had further events; without ``now`` for all."""
         for address in [address for address, fold in self._folds.items() if now - fold.since >= FOLD_S]:
             if more := self._folds.pop(address).more:
                 counts = ", ".join(f"{count} more {kind}" for kind, count in more.items())
-                log.info("%s: %s: %s", self._name, address, counts)
+                template = "{listener}: {address}: {counts}"
+                log.info("hq_connections", template, listener=self._name, address=address, counts=counts)
 
 
 class FailureLog:
@@ -88,7 +84,8 @@ class FailureLog:
         self._count.value += 1
         kind = (what, type(error))
         if isinstance(error, EncodeError | ProtocolError):
-            log.debug("%s: %s: %s", self._name, what, error)
+            log.debug("message_left_out", "{listener}: {what}: {error}", listener=self._name, what=what, error=error)
         elif kind not in self._logged and len(self._logged) < FAILURES:
             self._logged.add(kind)
-            log.error("%s: %s: %r; continuing without it", self._name, what, error, exc_info=error)
+            template = "{listener}: {what}: {error!r}; continuing without it"
+            log.error("protocol_failed", template, listener=self._name, what=what, error=error, exc_info=error)

@@ -25,10 +25,11 @@ from zbridge.lease.lease_client import LeaseClient
 from zbridge.lease.lease_events import LeaseEvent, LeaseEventKind
 from zbridge.lease.lease_holder import LeaseHolder
 from zbridge.lease.stick import StickAction
+from zbridge.log import Log
 from zbridge.protocol.kept import Exported
 from zbridge.protocol.rate_limit import RateLimit
 
-log = logging.getLogger("zbridge.hq")
+log = Log("zbridge.hq")
 
 OPEN_HZ = 50.0
 """Commands a second of one client that need no lease: they share the robot's queue with those of all programs."""
@@ -244,7 +245,7 @@ class Operator:
         waiting = self._queue.begin()
         self._tell_mode(self._queue.send)
         self._queue.resume(waiting)
-        log.info("%s drives %s", self.who, self._bridge.keys.robot)
+        log.info("hq_drives", "{session} drives {robot}", session=self.who, robot=self._bridge.keys.robot)
 
     def _release(self, why: str) -> None:
         self._drop(why)
@@ -252,8 +253,14 @@ class Operator:
         self._lease.drop()
 
     def _drop(self, why: str) -> None:
-        level = logging.INFO if self.intent.held else logging.DEBUG
-        log.log(level, "%s does not drive %s: %s", self.who, self._bridge.keys.robot, why)
+        log.log(
+            logging.INFO if self.intent.held else logging.DEBUG,
+            "hq_drives_not",
+            "{session} does not drive {robot}: {reason}",
+            session=self.who,
+            robot=self._bridge.keys.robot,
+            reason=why,
+        )
         self._queue.clear()
         self._set.clear()
 

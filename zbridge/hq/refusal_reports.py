@@ -7,7 +7,6 @@ A stick that is held down is refused fifty times a second: repetitions are folde
 from __future__ import annotations
 
 import asyncio
-import logging
 
 from zbridge.bus import Bus
 from zbridge.errors import BusError, Refused
@@ -16,10 +15,11 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import TOLD, Refusal, Refusals
 from zbridge.fleet.topics import KeySpace
 from zbridge.lease.lease_events import EXPLAINED, NAMED
+from zbridge.log import Log
 from zbridge.metrics import Count
 from zbridge.tasks import Tasks
 
-log = logging.getLogger("zbridge.hq")
+log = Log("zbridge.hq")
 
 EVERY_S = 0.5
 """Seconds between two reports."""
@@ -82,6 +82,6 @@ class RefusalReports:
         try:
             for answer in await self._bus.ask(self._key, payload, timeout_s=TELL_S):
                 if answer.error is not None:
-                    log.debug("%s: %s", self._key, answer.error)
+                    log.debug("report_refused", "{key}: {reason}", key=self._key, reason=answer.error)
         except BusError as error:
-            log.debug("%s: %s", self._key, error)
+            log.debug("report_refused", "{key}: {reason}", key=self._key, reason=error)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 
 from zbridge.errors import BusError, PayloadError, Unsupported
@@ -11,8 +10,9 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import Topic
 from zbridge.hq.context import ListenerContext
+from zbridge.log import Log
 
-log = logging.getLogger("zbridge.hq")
+log = Log("zbridge.hq")
 
 ANSWER_S = 2.5
 """Longest time a query waits for the robot's answer."""
@@ -57,7 +57,7 @@ class RobotQueries:
                 if answer.error is None:
                     message = payloads.decode(expected, answer.payload)
         except (BusError, PayloadError) as error:
-            log.debug("%s: %s: %s", context.name, topic.path, error)
+            log.debug("query_failed", "{name}: {topic}: {error}", name=context.name, topic=topic.path, error=error)
         finally:
             waiting = self._waiting.pop(topic.path)
         for answered in waiting.values():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterable
 
 from zbridge.bus import Bus, Handle, Sample
@@ -12,9 +11,10 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import Delivery, KeySpace, Topic
 from zbridge.fleet.view import RobotView
+from zbridge.log import Log
 from zbridge.metrics import Metrics
 
-log = logging.getLogger("zbridge.hq")
+log = Log("zbridge.hq")
 
 Follow = Callable[[Topic, FleetMessage], None]
 _KNOWN = 1024
@@ -93,7 +93,7 @@ class RobotSubscription:
             message = payloads.decode(topic.message, sample.payload)
         except PayloadError as error:
             self._malformed.value += 1
-            log.debug("%s: %s", sample.key, error)
+            log.debug("message_malformed", "{key}: {error}", key=sample.key, error=error)
             return
         self.view.note(topic, message)
         for follower in tuple(followers):

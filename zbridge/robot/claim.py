@@ -6,7 +6,6 @@ A claim is the answer to a query. The bus tells whose claim an answer is (the re
 from __future__ import annotations
 
 import contextlib
-import logging
 import math
 from collections.abc import Iterable
 
@@ -15,8 +14,9 @@ import msgspec
 from zbridge.bus import Answer
 from zbridge.control.latch import LatchRecord
 from zbridge.fleet.messages import Latch, StopId
+from zbridge.log import Log
 
-log = logging.getLogger("zbridge.app.gateway")
+log = Log("zbridge.app.gateway")
 
 CLAIM = "@rpc/claim/gateway"
 """The path at which a gateway answers with its claim."""
@@ -134,7 +134,7 @@ class OtherGateways:
     def __init__(self, robot: str) -> None:
         self._robot = robot
         self._without_claim = 0
-        self._said: set[str] = set()
+        self._logged: set[str] = set()
         self._close_until: float | None = None
 
     def seen(self, token: bool, claim: bool, *, leaving: bool) -> bool:
@@ -142,18 +142,20 @@ class OtherGateways:
         if claim:
             self._without_claim = 0
             self._close_until = -math.inf if leaving else math.inf
-            self._say("another gateway serves %s: waiting until it goes")
+            if self._is_new("serves"):
+                log.warning("robot_served", "another gateway serves {robot}: waiting until it goes", robot=self._robot)
             return True
         self._without_claim = self._without_claim + 1 if token else 0
-        if self._without_claim == LOOKS:
-            self._say("a gateway of %s has a token but does not answer: ignoring it")
+        if self._without_claim == LOOKS and self._is_new("silent"):
+            text = "a gateway of {robot} has a token but does not answer: ignoring it"
+            log.warning("gateway_silent", text, robot=self._robot)
         return 0 < self._without_claim < LOOKS
 
     def close_until(self, now: float) -> float:
         """Return until when others must be looked for closely: one that went without a goodbye may come back."""
         return now + YOUNG_S if self._close_until is None else self._close_until
 
-    def _say(self, text: str) -> None:
-        if text not in self._said:
-            self._said.add(text)
-            log.warning(text, self._robot)
+    def _is_new(self, finding: str) -> bool:
+        new = finding not in self._logged
+        self._logged.add(finding)
+        return new

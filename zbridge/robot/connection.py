@@ -6,7 +6,6 @@ Knows no bus and no translation.
 from __future__ import annotations
 
 import asyncio
-import logging
 import random
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -16,6 +15,7 @@ import msgspec
 
 from zbridge.errors import LinkError, ProtocolError
 from zbridge.fleet.messages import LinkStatus, RobotState
+from zbridge.log import Log
 from zbridge.protocol.address import DeviceAddress
 from zbridge.protocol.kept import Budget, Exported
 from zbridge.protocol.session import Session, State
@@ -25,7 +25,7 @@ from zbridge.transport import Conversation, ConversationHooks, Link, Parcel, att
 from zbridge.transport.reading import FairShare
 from zbridge.wire.frames import Partial
 
-log = logging.getLogger("zbridge.link")
+log = Log("zbridge.link")
 
 Connect = Callable[[DeviceAddress, Conversation], Any]
 """``await connect(address, receiver)``: raises LinkError if there is no connection to be had."""
@@ -157,10 +157,11 @@ class Connection:
             if established:
                 backoff.reset()
             if self._ending:
-                log.info("%s: %s", self._label, reason)
+                log.info("link_closed", "{link}: {reason}", link=self._label, reason=reason)
                 return
             delay_s = backoff.delay_s()
-            log.info("%s: %s; next attempt in %.1f s", self._label, reason, delay_s)
+            template = "{link}: {reason}; next attempt in {delay_s:.1f} s"
+            log.info("link_lost", template, link=self._label, reason=reason, delay_s=delay_s)
             self._set_state("offline", reason)
             await asyncio.sleep(delay_s)
             await self._free.wait()
@@ -293,7 +294,8 @@ class Connection:
             self._hooks.connected(self.name, "established")
             agreed = [f"version {session.version}"] if session.version else []
             agreed += [f"features {', '.join(session.features)}"] if session.features else []
-            log.info("%s: %s", self._label, ", ".join(["established", *agreed]))
+            text = ", ".join(["established", *agreed])
+            log.info("link_established", "{link}: {agreed}", link=self._label, agreed=text, peer=session.peer)
         self._hooks.session_changed(session)
         self._set_state(_STATES[session.state], session.busy or session.reason)
 

@@ -26,7 +26,6 @@ goodbye to. Who is asked by another gateway that serves the robot asks too.
 from __future__ import annotations
 
 import asyncio
-import logging
 import math
 import random
 import time
@@ -40,12 +39,13 @@ from zbridge.bus import Bus
 from zbridge.control.latch import LatchRecord
 from zbridge.errors import BusError
 from zbridge.fleet.topics import KeySpace
+from zbridge.log import Log
 from zbridge.machine import step
 from zbridge.protocol.kept import Exported
 from zbridge.robot.claim import LOOKS, Claim, OtherGateways, Standing
 from zbridge.robot.claim_bus import ClaimBus
 
-log = logging.getLogger("zbridge.app.gateway")
+log = Log("zbridge.app.gateway")
 
 LOOK_S = 0.25
 """Seconds between two looks for other gateways while the robot is not owned."""
@@ -169,7 +169,7 @@ class Ownership:
         while True:
             await self._bus.next_look(lambda: self.yielded or self._clock() < self._close_until)
             if not self.hands_over and not self._waits and await self._meet(served) is OwnershipState.LOOKING:
-                log.error("another gateway serves %s: leaving it alone", self._robot)
+                log.error("robot_left", "another gateway serves {robot}: leaving it alone", robot=self._robot)
                 return
 
     async def _meet(self, served: Served) -> OwnershipState:
@@ -194,8 +194,14 @@ class Ownership:
             await served.step_aside()
             return self._state
         if self._state is not state:
-            log.error("%s: %s", self._robot, _TURNS[self._state])
-            await (served.step_in() if self._state is OwnershipState.OWNING else served.step_aside())
+            if self._state is OwnershipState.OWNING:
+                text = "{robot}: no other gateway has a better claim: serving it again"
+                log.error("robot_regained", text, robot=self._robot)
+                await served.step_in()
+            else:
+                text = "{robot}: another gateway serves it: leaving the robot alone, and staying connected"
+                log.error("robot_yielded", text, robot=self._robot)
+                await served.step_aside()
         served.heard(serving)
         return self._state
 
@@ -330,9 +336,3 @@ class Ownership:
             OwnershipInput.RELEASE: (_withdraw, OwnershipState.LOOKING),
         },
     }
-
-
-_TURNS = {
-    OwnershipState.OWNING: "no other gateway has a better claim: serving it again",
-    OwnershipState.YIELDED: "another gateway serves it: leaving the robot alone, and staying connected",
-}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 import socket
 from typing import Any
 
@@ -16,13 +15,14 @@ from zbridge.control.standstill import Standstill
 from zbridge.errors import Refused
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Status
+from zbridge.log import Log
 from zbridge.protocol.session import Session, State
 from zbridge.robot.commands import LINK_BLOCKED, Commands
 from zbridge.robot.connection import Links
 from zbridge.robot.observer import Observer
 from zbridge.robot.queries import PendingQueries
 
-log = logging.getLogger("zbridge.robot.device")
+log = Log("zbridge.robot.device")
 
 
 class Presence:
@@ -96,7 +96,7 @@ class Presence:
         self._context.conditions.set("link", f"{LINK_BLOCKED}: it is not driven" if stalled else None)
         if stalled:
             self._stalls.value += 1
-            log.warning("%s: %s", self._context.keys.robot, LINK_BLOCKED)
+            log.warning("link_stalled", "{robot}: {reason}", robot=self._context.keys.robot, reason=LINK_BLOCKED)
         else:
             self._enforcer.require_neutral("the robot's link stalled", StopCause.LINK_STALLED, stops=True)
 

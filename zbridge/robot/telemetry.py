@@ -8,7 +8,6 @@ stream drops the oldest, and a lossless bus asks to pause: then the links read n
 
 from __future__ import annotations
 
-import logging
 from functools import partial
 from typing import Any
 
@@ -18,6 +17,7 @@ from zbridge.errors import ProtocolError, Refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.topics import Delivery, Topic
+from zbridge.log import Log
 from zbridge.metrics import Count, Metrics
 from zbridge.protocol.plugin import Translate
 from zbridge.protocol.session import Datagram
@@ -26,7 +26,7 @@ from zbridge.robot.on_demand import Listened, OnDemand
 from zbridge.robot.publishers import RobotPublishers
 from zbridge.robot.queries import PendingQueries
 
-log = logging.getLogger("zbridge.robot.telemetry")
+log = Log("zbridge.robot.telemetry")
 
 ATTEND_EVERY = 64
 """Messages of a read between two looks at the commands that wait."""
@@ -113,7 +113,7 @@ class Telemetry:
                         self._pending.answer(topic, payload)
             except ProtocolError as error:
                 self._untranslatable.value += 1
-                log.debug("%s: %s", self._context.keys.robot, error)
+                log.debug("message_untranslatable", "{robot}: {error}", robot=self._context.keys.robot, error=error)
         batch = []
         for path, stream in streams.items():
             batch.append((known[path], stream))

@@ -15,9 +15,10 @@ import logging
 from collections.abc import Callable
 from typing import Any
 
+from zbridge.log import Log
 from zbridge.protocol.session import Session, State
 
-log = logging.getLogger("zbridge.link")
+log = Log("zbridge.link")
 
 FIRST = 16
 """First frames of a conversation that are kept, also where there is no handshake."""
@@ -71,9 +72,10 @@ class WireTap:
             self._session.tap = self._take
 
     def _take(self, direction: str, frame: bytes) -> None:
-        debug = log.isEnabledFor(logging.DEBUG)
+        debug = log.enabled(logging.DEBUG)
         if debug:
-            log.debug("%s %s %s", "<" if direction == "in" else ">", self._label, frame[:_LOGGED].hex(" "))
+            mark, start = "<" if direction == "in" else ">", frame[:_LOGGED].hex(" ")
+            log.debug("frame", "{mark} {link} {start}", mark=mark, link=self._label, start=start, size_bytes=len(frame))
         self._number += 1
         entry = (self._number, direction, frame)
         if self._waiting is not None:

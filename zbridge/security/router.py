@@ -18,16 +18,12 @@ from zbridge.errors import BusError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.processes import Membership
+from zbridge.log import Log
 from zbridge.metrics import Metrics
 from zbridge.security.router_settings import RouterPlan, zenoh_values
 from zbridge.toml import prefixed
 
-log = logging.getLogger("zbridge.security.router")
-
-FOLD_S = 10.0
-"""Seconds within which the same warning is logged once, with its count."""
-KINDS = 64
-"""Most warnings that are counted separately; all others share one."""
+log = Log("zbridge.security.router")
 
 
 class Router:
@@ -49,7 +45,8 @@ class Router:
         try:
             if settings.tls is not None:
                 bus.answer(topics.whoami(settings.realm, "*"), self.answer)
-            log.info("router at %s: %s", ", ".join(settings.listen), self._summary())
+            at = ", ".join(settings.listen)
+            log.info("router_ready", "router at {address}: {summary}", address=at, summary=self._summary())
             await asyncio.Event().wait()
         finally:
             await bus.close()
@@ -58,16 +55,17 @@ class Router:
         """Log a process that connects or leaves."""
         name = neighbour.name or "somebody"
         if not here:
-            log.info("%s left, from %s", name, neighbour.address)
+            log.info("member_left", "{name} left, from {peer}", name=name, peer=neighbour.address)
         elif self._plan.settings.tls is not None and neighbour.name not in self._known:
             log.warning(
-                "%s connected from %s: its certificate is of this authority, but roles.toml does not name it: it hears"
-                " nothing and may do nothing",
-                name,
-                neighbour.address,
+                "member_unknown",
+                "{name} connected from {peer}: its certificate is of this authority, but roles.toml does not name it:"
+                " it hears nothing and may do nothing",
+                name=name,
+                peer=neighbour.address,
             )
         else:
-            log.info("%s connected from %s", name, neighbour.address)
+            log.info("member_connected", "{name} connected from {peer}", name=name, peer=neighbour.address)
 
     def answer(self, query: IncomingQuery) -> None:
         """Answer a member's query for its role."""
@@ -85,28 +83,10 @@ class Router:
         return f"mutual TLS, {len(names)} names, {len(robots)} robots in realm {self._plan.settings.realm}"
 
 
-class ZenohWarnings:
-    """Logs Zenoh's log in the terms of this project; :meth:`take` is called with each of its lines.
-
-    A peer that retries forever would fill the log: the same warning is logged once in :data:`FOLD_S`.
-    """
-
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
-        self._logged: dict[str, tuple[float, int]] = {}
-        """By warning, when it was logged, and its count since."""
-
-    def take(self, line: str) -> None:
-        level, text = translate_log_line(line)
-        if text not in self._logged and len(self._logged) >= KINDS:
-            text = "more kinds of Zenoh warnings than are counted apart"
-        at, more = self._logged.get(text, (-FOLD_S, 0))
-        now = self._clock()
-        if now - at < FOLD_S:
-            self._logged[text] = (at, more + 1)
-            return
-        self._logged[text] = (now, 0)
-        log.log(level, "%s%s", text, f" ({more} times more since it was last logged)" if more else "")
+def log_zenoh_line(line: str) -> None:
+    """Log a line of Zenoh's log in the terms of this project."""
+    level, text = translate_log_line(line)
+    log.log(level, "zenoh", "{warning}", warning=text)
 
 
 def translate_log_line(line: str) -> tuple[int, str]:

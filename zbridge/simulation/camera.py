@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 from collections.abc import Callable
 from email.utils import formatdate
 from itertools import count
 
 from zbridge.errors import LinkError
+from zbridge.log import Log
 from zbridge.protocol.address import Address
 
 SIDE = 8
@@ -46,7 +46,7 @@ def _entropy(greys: bytes) -> bytes:
     return bits.to_bytes((length + padding) // 8, "big").replace(b"\xff", b"\xff\x00")
 
 
-log = logging.getLogger("zbridge.simulation.camera")
+log = Log("zbridge.simulation.camera")
 
 PATH = "/stream.mjpg"
 EVERY_S = 0.1
@@ -71,13 +71,13 @@ async def _serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> 
     host, port, *_ = writer.get_extra_info("peername")
     with contextlib.suppress(OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, asyncio.CancelledError):
         request = await reader.readuntil(b"\r\n\r\n")
-        log.info("%s:%d watches", host, port)
+        log.info("viewer_watches", "{peer} watches", peer=f"{host}:{port}")
         if request.startswith(f"GET {PATH} ".encode()):
             await _stream(writer)
         else:
             writer.write(b"HTTP/1.0 404 Not Found\r\n\r\n")
             await writer.drain()
-    log.info("%s:%d has gone", host, port)
+    log.info("viewer_gone", "{peer} has gone", peer=f"{host}:{port}")
     writer.close()
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import enum
-import logging
 import socket
 import sys
 from abc import abstractmethod
@@ -17,12 +16,13 @@ from typing import Any
 
 import msgspec
 
+from zbridge.log import Log
 from zbridge.simulation.judge import Ended, Judge, MessageReader
 from zbridge.simulation.sockets import bind_tcp, send_at_once
 
 _UNANSWERED = 16
 Work = Coroutine[Any, Any, None]
-_log = logging.getLogger(__name__)
+_log = Log(__name__)
 
 
 class FragilePeer(Judge):
@@ -208,7 +208,12 @@ class FragileServer(FragilePeer):
 
 def log_violations(name: str = "") -> Callable[[str], None]:
     """Make the ``note`` of a judge: it logs each violation, with the judge's name if there are several."""
-    return lambda text: _log.error("violation%s: %s", name and f", {name}", text)
+
+    def note(text: str) -> None:
+        judge = name and f", {name}"
+        _log.error("violation", "violation{judge}: {violation}", judge=judge, violation=text)
+
+    return note
 
 
 def print_line(line: str) -> None:

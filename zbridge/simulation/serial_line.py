@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import os
 import tty
 from collections.abc import Callable, Coroutine
@@ -17,6 +16,7 @@ from typing import Any
 
 import msgspec
 
+from zbridge.log import Log
 from zbridge.protocol.address import Address, SerialAddress
 from zbridge.protocol.plugin import Simulation
 from zbridge.tasks import race
@@ -28,7 +28,7 @@ STALLED_S = 0.5
 """Seconds without any progress after which what waits for a reader of the near end is dropped as outdated."""
 RECONNECT_S = 0.1
 """Seconds from the end of a connection with the simulated robot to the next one."""
-_log = logging.getLogger(__name__)
+_log = Log(__name__)
 
 
 async def simulate_on_serial_line(
@@ -89,9 +89,11 @@ class SerialLine:
                 reader, self._robot = await asyncio.open_connection(robot.host, robot.port)
                 while data := await reader.read(READ_BYTES):
                     self._write(data)
-                _log.debug("%s: the simulated robot closed its connection", self.address)
+                _log.debug(
+                    "serial_closed", "{address}: the simulated robot closed its connection", address=self.address
+                )
             except OSError as error:
-                _log.debug("%s: %s: %s", self.address, robot, error)
+                _log.debug("serial_failed", "{address}: {peer}: {error}", address=self.address, peer=robot, error=error)
             finally:
                 writer, self._robot = self._robot, None
                 if writer is not None:
@@ -153,4 +155,5 @@ class SerialLine:
     def _drop(self, count: int, why: str) -> None:
         if count > 0:
             self.dropped += count
-            _log.debug("%s: dropped %d bytes %s, %d in all", self.address, count, why, self.dropped)
+            template = "{address}: dropped {count} bytes {why}, {dropped} in all"
+            _log.debug("bytes_dropped", template, address=self.address, count=count, why=why, dropped=self.dropped)

@@ -7,14 +7,14 @@ Knows no protocol. The gateways of this package simulate several clients and lin
 from __future__ import annotations
 
 import asyncio
-import logging
 from abc import ABC, abstractmethod
 
 from zbridge.errors import ConfigError, ProtocolError
+from zbridge.log import Log
 from zbridge.protocol.address import Address
 from zbridge.protocol.plugin import Simulation, Truth
 
-log = logging.getLogger(__name__)
+log = Log(__name__)
 
 STEP_S = 0.01
 """Seconds between two steps of a simulated robot."""
@@ -71,7 +71,7 @@ async def serve(simulation: Simulation, robot: SimulatedRobot) -> None:
         except ConnectionError:
             pass
         except ProtocolError as error:  # what it was sent can be no frame
-            log.debug("the client is closed: %s", error)
+            log.debug("client_closed", "the client is closed: {error}", error=error)
         finally:
             writers.discard(writer)
             writer.close()

@@ -15,6 +15,7 @@ from functools import partial
 from typing import Any, Generic, TypeVar
 
 from zbridge.errors import EncodeError, Refused
+from zbridge.log import Log
 from zbridge.protocol.plugin import Simulation, Truth
 from zbridge.protocol.session import Session, State
 from zbridge.simulation.timing import Ticker
@@ -47,7 +48,7 @@ class Simulator(ABC, Generic[M]):
     """The robot in the room; it begins at ``Simulation.place``."""
 
     def __init__(self, log: logging.Logger, *, links: tuple[str, ...] = ("robot",), datagrams: bool = False) -> None:
-        self._log, self._links, self._datagrams = log, links, datagrams
+        self._log, self._links, self._datagrams = Log(log.name), links, datagrams
         self._loop = asyncio.get_running_loop()
         self._clients: dict[Conversation, str] = {}
 
@@ -100,7 +101,7 @@ class Simulator(ABC, Generic[M]):
                     self.check(session, message)
                     session.send(message)
             except (Refused, EncodeError) as error:
-                self._log.debug("%s: not sent, %s", session.name, error)
+                self._log.debug("message_not_sent", "{session}: not sent, {error}", session=session.name, error=error)
             client.pump()
 
     # Running
@@ -136,7 +137,7 @@ class Simulator(ABC, Generic[M]):
         hooks = ConversationHooks(deliver=lambda messages: self._deliver(client, messages))
         client = ClientConversation(session, self._loop, hooks)
         client.ended.add_done_callback(lambda _: self._dismiss(client))
-        self._log.info("%s: connected as %s", link.peer, session.name)
+        self._log.info("client_connected", "{peer}: connected as {session}", peer=link.peer, session=session.name)
         self._loop.call_soon(self._greet, client, name)  # the session is opened first
         return client
 
@@ -150,6 +151,7 @@ class Simulator(ABC, Generic[M]):
             self.take(client, message)
 
     def _dismiss(self, client: Conversation) -> None:
-        self._log.info("%s: %s", client.session.peer, client.session.reason)
+        ended = client.session
+        self._log.info("client_gone", "{peer}: {reason}", peer=ended.peer, reason=ended.reason, session=ended.name)
         self._clients.pop(client, None)
         self.dismiss(client)

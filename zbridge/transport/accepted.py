@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 
 from zbridge.errors import Refused
+from zbridge.log import Log
 from zbridge.protocol.traffic import SourceClaims
 from zbridge.transport.conversation import Conversation, then_pump
 from zbridge.transport.link import Link, Receiver
 
-log = logging.getLogger("zbridge.link")
+log = Log("zbridge.link")
 
 
 class Accepted(Receiver):
@@ -44,7 +44,8 @@ class ClientConversation(Conversation):
         if isinstance(session, SourceClaims):
             session.rivalled(self._clock())
         if self._hooks.may_warn("with a rival source of datagrams"):
-            log.warning("%s: another source of datagrams claims to be %s", self.session.name, self.session.peer)
+            template = "{session}: another source of datagrams claims to be {peer}"
+            log.warning("rival_source", template, session=session.name, peer=session.peer)
 
     def stray_datagram(self, datagram: bytes) -> None:
         session = self.session

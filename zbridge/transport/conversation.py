@@ -16,7 +16,6 @@ acknowledged.
 from __future__ import annotations
 
 import asyncio
-import logging
 import math
 from collections.abc import Callable
 from functools import wraps
@@ -25,6 +24,7 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 import msgspec
 
 from zbridge.errors import FAULT, Refused, describe
+from zbridge.log import Log
 from zbridge.metrics import Count, Histogram
 from zbridge.protocol.kept import Budget, Exported
 from zbridge.protocol.session import Datagram, Session, State
@@ -32,7 +32,7 @@ from zbridge.transport.link import STALLED_S, Link, Receiver
 from zbridge.transport.reading import FairShare, ReadControl
 from zbridge.transport.transferable import Parcel
 
-log = logging.getLogger("zbridge.link")
+log = Log("zbridge.link")
 
 LATE_S = 0.02
 """A session's timer that fires this late shows that the process, or the machine, was delayed; seconds."""
@@ -181,7 +181,14 @@ class Conversation(Receiver):
         self._hooks.malformed.value += count - logged
         # a warning at malformed messages 1, 2, 4, 8 ...: the log stays readable in a flood
         if count.bit_length() != logged.bit_length() and self._hooks.may_warn("warnings of malformed messages"):
-            log.warning("%s: %d malformed so far, last: %s", self.session.name, count, self.session.last_malformed)
+            log.warning(
+                "messages_malformed",
+                "{session}: {count} malformed so far, last: {error}",
+                session=self.session.name,
+                peer=self.session.peer,
+                count=count,
+                error=self.session.last_malformed,
+            )
         self._malformed_logged = count
 
     def _timed(self, begun: float) -> None:
@@ -192,15 +199,16 @@ class Conversation(Receiver):
 
     def _fault(self, error: Exception) -> None:
         """End the session, and log where the code of its protocol is wrong."""
-        log.error("%s: %s%s", self.session.name, FAULT, describe(error), exc_info=error)
-        self.session.fail(f"{FAULT}{describe(error)}")
+        reason = f"{FAULT}{describe(error)}"
+        log.error("session_fault", "{session}: {reason}", session=self.session.name, reason=reason, exc_info=error)
+        self.session.fail(reason)
         self._end()
         self._notify()
 
     @then_pump
     def lost(self, reason: str) -> None:
         if self._observed is not None:
-            log.debug("%s: %s", self.session.peer, reason)
+            log.debug("connection_lost", "{peer}: {reason}", peer=self.session.peer, reason=reason)
             self._hooks.linked(self._observed, False)
         self.link = self._observed = self.reading.link = None
         self.session.fail(reason)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import socket
 import struct
 from collections.abc import AsyncIterator, Callable
@@ -15,6 +14,7 @@ from functools import partial
 from typing import cast
 
 from zbridge.errors import LinkError
+from zbridge.log import Log
 from zbridge.metrics import Count
 from zbridge.protocol.address import Address
 from zbridge.protocol.kept import Exported
@@ -26,7 +26,7 @@ from zbridge.transport.tcp_options import KEEPALIVE_S, bound_retries, keep_alive
 from zbridge.transport.transferable import Parcel
 from zbridge.transport.udp import DatagramHub, DatagramSocket
 
-log = logging.getLogger("zbridge.link")
+log = Log("zbridge.link")
 
 READ_BYTES = 64 * 1024
 """Most bytes read from a robot's socket before the loop serves others."""
@@ -109,7 +109,9 @@ class TcpLink(asyncio.BufferedProtocol, Link):
                 try:
                     self._datagrams = DatagramSocket(self._transport, self, kernel=self._kernel)
                 except OSError as error:  # no descriptor, no port: the datagram is lost, the next one tries again
-                    log.warning("%s: no socket for datagrams: %s", self.peer, error)
+                    log.warning(
+                        "no_datagram_socket", "{peer}: no socket for datagrams: {error}", peer=self.peer, error=error
+                    )
                     return
             self._datagrams.send(data)
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import socket
 
+from zbridge.log import Log
 from zbridge.transport.backlog import Backlog
 from zbridge.transport.kernel import Kernel
 
-log = logging.getLogger("zbridge.link")
+log = Log("zbridge.link")
 
 KEEPALIVE_S = 1
 """Seconds of silence after which the kernel sends keep-alives to an accepted peer."""
@@ -58,7 +58,8 @@ def new_backlog(sock: socket.socket, kernel: Kernel) -> Backlog | None:
     except OSError:
         if not _unwatched_warned:
             _unwatched_warned = True
-            log.warning("this platform does not report unacknowledged bytes: drives are also written to broken links")
+            text = "this platform does not report unacknowledged bytes: drives are also written to broken links"
+            log.warning("backlog_unknown", text)
         return None
     backlog = Backlog()
     if unsent := kernel.unacknowledged(sock):  # of the process that had the connection before

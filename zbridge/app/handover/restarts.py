@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import socket
 import time
 from collections.abc import Callable, Sequence
@@ -23,13 +22,14 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Query
 from zbridge.fleet.topics import KeySpace
+from zbridge.log import Log
 from zbridge.protocol.kept import Budget, Exported
 from zbridge.robot.device import RobotDevice
 from zbridge.robot.ownership import Ownership
 from zbridge.transport import Parcel, Transferable
 from zbridge.transport.kernel import KERNEL, Kernel
 
-log = logging.getLogger("zbridge.app.handover")
+log = Log("zbridge.app.handover")
 
 
 class ClaimPart(Transferable):
@@ -175,7 +175,8 @@ class Restarts:
             machine = (self._processes, self._kernel)
             self._outgoing = Outgoing(self._successor, self._parts, self._describe, *machine)
             pid = await self._outgoing.run()
-            log.info("handed over to process %d in %.0f ms", pid, (self._clock() - began) * 1000)
+            took_ms = (self._clock() - began) * 1000
+            log.info("handed_over", "handed over to process {pid} in {took_ms:.0f} ms", pid=pid, took_ms=took_ms)
 
     def _parts(self) -> list[Transferable]:
         return [part for part in (*self.listeners, self.device, self.claim) if part is not None]

@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import socket
 from collections.abc import Callable, Sequence
 from typing import TypeVar
@@ -30,11 +29,12 @@ from typing import TypeVar
 from zbridge.app.handover.channel import VERSION, EndError, Failed, Go, HandoverChannel, HandoverState, Hello, Up
 from zbridge.app.handover.processes import PROCESSES, OtherProcess, Processes, Successor
 from zbridge.errors import BusError, HandoverError, NotReady, Refused
+from zbridge.log import Log
 from zbridge.protocol.kept import Exported
 from zbridge.transport import Parcel, Transferable
 from zbridge.transport.kernel import KERNEL, Kernel
 
-log = logging.getLogger("zbridge.app.handover")
+log = Log("zbridge.app.handover")
 
 M = TypeVar("M")
 
@@ -85,7 +85,7 @@ class Outgoing:
         try:
             channel, far = self._processes.pair()
         except OSError as error:
-            log.error("not restarted: %s", error)
+            log.error("not_restarted", "not restarted: {reason}", reason=error)
             raise NotReady(f"not restarted: {error}") from error
         changed = supervised = False
         try:
@@ -160,7 +160,7 @@ class Outgoing:
 
     async def _take_back(self, channel: HandoverChannel, reason: str, *, changed: bool) -> None:
         """End the successor; resume when it has ended."""
-        log.error("not restarted: %s", reason)
+        log.error("not_restarted", "not restarted: {reason}", reason=reason)
         channel.send_now(Failed(reason))
         if self._process is not None:
             await self._process.kill()
@@ -234,7 +234,7 @@ class Incoming:
         except EndError as error:
             if self._supervised:
                 raise HandoverError("the previous gateway died: the supervisor stops its robot") from error
-            log.warning("the previous gateway died: continuing in its place")
+            log.warning("predecessor_died", "the previous gateway died: continuing in its place")
         self._channel.close()
         self.begun.set()
 

@@ -6,14 +6,14 @@ A later watcher is notified at once of the tokens that the others know.
 from __future__ import annotations
 
 import asyncio
-import logging
 from collections.abc import Callable
 from functools import partial
 
 from zbridge.bus.interface import Handle
 from zbridge.bus.zenoh.declared import undoing
+from zbridge.log import Log
 
-log = logging.getLogger("zbridge.bus")
+log = Log("zbridge.bus")
 
 Changed = Callable[[str, bool], None]
 """Called with the key of a token that exists (True) or has disappeared (False)."""
@@ -72,7 +72,7 @@ class _Watcher:
         try:
             self._handler(key, alive)
         except Exception:
-            log.exception("a handler failed")
+            log.exception("handler_failed", "a handler failed")
 
 
 class _Watch:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ctypes
 import itertools
-import logging
 import threading
 import time
 from collections.abc import Callable
@@ -17,7 +16,9 @@ from typing import Any
 
 import zenoh
 
-log = logging.getLogger("zbridge.bus")
+from zbridge.log import Log
+
+log = Log("zbridge.bus")
 
 UNDECLARE_S = 1.0
 """Longest time for which undeclaring an entity is retried while its callback keeps running."""
@@ -97,7 +98,8 @@ def _undeclare_later(entity: Any) -> None:
         time.sleep(_PAUSE_S)
         if _undeclare(entity):
             return
-    log.error("%s could not be undeclared: Already borrowed for %g s", type(entity).__name__, UNDECLARE_S)
+    template = "{entity} could not be undeclared: Already borrowed for {waited_s:g} s"
+    log.error("undeclare_failed", template, entity=type(entity).__name__, waited_s=UNDECLARE_S)
 
 
 def _undeclare(entity: Any) -> bool:

@@ -6,7 +6,6 @@ and put it into the inbox, or call a handler that asked for that.
 
 from __future__ import annotations
 
-import logging
 from collections import Counter
 from collections.abc import Callable
 from typing import Any
@@ -21,10 +20,11 @@ from zbridge.errors import BusError, PayloadError, Refused, refusal
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.lease_messages import Denied
 from zbridge.fleet.topics import is_concrete
+from zbridge.log import Log
 from zbridge.metrics import Count
 from zbridge.protocol.rate_limit import RateLimit
 
-log = logging.getLogger("zbridge.bus")
+log = Log("zbridge.bus")
 
 QUERIES_HZ = 500.0
 """Queries a second that one queryable answers."""
@@ -63,7 +63,7 @@ def direct_callback(key_expr: str, handler: Callable[[Sample], None]) -> Callabl
         try:
             handler(Sample(own_key or str(raw.key_expr), raw.payload.to_bytes(), shown))
         except Exception:
-            log.exception("a handler failed")
+            log.exception("handler_failed", "a handler failed")
 
     return call
 

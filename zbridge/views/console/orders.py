@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 from collections.abc import Awaitable, Callable
 from typing import Any
 
@@ -13,6 +12,7 @@ from zbridge.client.fleet import Fleet
 from zbridge.client.stops import listed, new_stop, summarize
 from zbridge.errors import RateLimited, ZbridgeError, describe
 from zbridge.fleet.messages import Stop
+from zbridge.log import Log
 from zbridge.views.console.feed import FleetFeed
 from zbridge.views.console.fleet_stop import StopReport, stop_fleet
 from zbridge.views.console.history import ControlHistory
@@ -20,7 +20,7 @@ from zbridge.views.console.journal import Journal
 from zbridge.views.console.rights import Caller
 from zbridge.views.console.roster import Roster
 
-log = logging.getLogger("zbridge.console")
+log = Log("zbridge.console")
 
 SAME_PRESS_S = 0.1
 """Seconds within which two presses are one: nobody can have driven the robot in between."""
@@ -146,7 +146,7 @@ class Orders:
         except ZbridgeError as error:
             report = StopReport(f"{_TITLES.get(action, '')}{error}", good=False)
         except Exception as error:  # whatever it is, who pressed must know
-            log.exception("%s %s", action, robot)
+            log.exception("order_failed", "{action} {robot}", action=action, robot=robot)
             report = StopReport(f"{_TITLES.get(action, '')}this console failed: {describe(error)}", good=False)
         self._journal.note(caller, action, robot, report.text)
         if self._is_newest(asyncio.current_task(), robot):

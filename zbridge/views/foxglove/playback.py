@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-import logging
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any
@@ -19,6 +18,7 @@ import msgspec
 from mcap.reader import NonSeekingReader, SeekingReader
 
 from zbridge.errors import ZbridgeError, describe
+from zbridge.log import Log
 from zbridge.tasks import occurs
 from zbridge.views.foxglove import replies
 from zbridge.views.foxglove.hub import Hub, Subscriber
@@ -29,7 +29,7 @@ from zbridge.views.pictures import ViewerChannel
 from zbridge.views.recording.player import PlaybackClock
 from zbridge.views.schemas import Schema
 
-log = logging.getLogger("zbridge.foxglove")
+log = Log("zbridge.foxglove")
 
 BATCH = 64
 """Messages that are read at once."""
@@ -151,7 +151,7 @@ class IndexedRecording:
         except OSError:
             raise
         except Exception as error:  # whatever the library raises; a cut is the usual cause
-            log.info("%s: read up to: %s", self.path, describe(error))
+            log.info("recording_cut", "{file}: read up to: {error}", file=self.path, error=describe(error))
 
 
 class Playback(ViewerSource):

@@ -25,6 +25,7 @@ from zbridge.bus import BusSettings, open_bus
 from zbridge.client import Fleet
 from zbridge.errors import ConfigError
 from zbridge.fleet.printable import shown
+from zbridge.log import Log
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.views.foxglove.admission import Admitted, Policy, ViewerAdmission
@@ -37,7 +38,7 @@ from zbridge.views.foxglove.settings import FoxglovePlan
 from zbridge.views.foxglove.source import ViewerSource
 from zbridge.views.foxglove.viewer import Overrun, Viewer
 
-log = logging.getLogger("zbridge.foxglove")
+log = Log("zbridge.foxglove")
 
 MESSAGE_BYTES = 1024 * 1024
 """Bound of a viewer's message."""
@@ -114,13 +115,14 @@ class ViewerServer:
             await server.wait_closed()
             if self.refused:
                 refused = ", ".join(f"{reason} {count}" for reason, count in sorted(self.refused.items()))
-                log.info("connections refused: %s", refused)
+                log.info("connections_refused", "connections refused: {counts}", counts=refused)
 
     def turn_away(self, reason: str, host: str, what: str = "") -> None:
         """Count a connection that is refused. what: of it people need to know, from the peer."""
         self._metrics.count("foxglove_refused", reason=reason).value += 1
         self.refused[reason] += 1
-        log.debug("%s turned away: %s %s", host, reason, shown(what))
+        template = "{peer} turned away: {reason} {what}"
+        log.debug("viewer_turned_away", template, peer=host, reason=reason, what=shown(what))
 
     def _admit(self, connection: ServerConnection, request: HttpRequest) -> Response | None:
         """Turn a handshake away, or note what the viewer is."""
@@ -151,7 +153,8 @@ class ViewerServer:
         clock = asyncio.get_running_loop().time
         viewer = Viewer(name, self._source, connection, may_drive=admitted.may_drive, clock=clock)
         self.viewers.add(viewer)
-        log.info("%s came%s", name, ", may drive" if admitted.may_drive else "")
+        rights = ", may drive" if admitted.may_drive else ""
+        log.info("viewer_came", "{session} came{rights}", session=name, rights=rights, peer=_host(connection))
         why = "left"
         try:
             await viewer.run()
@@ -167,7 +170,8 @@ class ViewerServer:
             for reason, count in viewer.counts.items():
                 self._metrics.count("foxglove_viewer_messages", what=reason).value += count
             counted = ", ".join(f"{reason} {count}" for reason, count in sorted(viewer.counts.items()) if count)
-            log.info("%s %s (%s)", name, why, counted or "sent nothing")
+            counts = counted or "sent nothing"
+            log.info("viewer_left", "{session} {reason} ({counts})", session=name, reason=why, counts=counts)
 
 
 class _Guarded(ServerConnection):
@@ -242,7 +246,8 @@ async def serve_file(
     """Serve a recording; raise ZbridgeError if it cannot be read. on_ready: called when viewers are accepted."""
     recording = await asyncio.to_thread(IndexedRecording, file)
     if not recording.whole:
-        log.warning("%s: has no index, as if it was cut off; it is played up to the cut", file)
+        text = "{file}: has no index, as if it was cut off; it is played up to the cut"
+        log.warning("recording_without_index", text, file=file)
     await _serve(plan, Playback(Hub(), recording), metrics, on_ready)
 
 

@@ -7,7 +7,6 @@ sends more than ``RATE_HZ`` a second, or lets too many answers queue up, is clos
 from __future__ import annotations
 
 import asyncio
-import logging
 import math
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
@@ -15,6 +14,7 @@ from typing import Any, Protocol
 
 from zbridge.errors import BusError, ProtocolError, Refused, Unsupported, describe
 from zbridge.fleet.printable import shown
+from zbridge.log import Log
 from zbridge.protocol.rate_limit import RateLimit
 from zbridge.tasks import Tasks, race
 from zbridge.views.foxglove import replies, requests
@@ -22,7 +22,7 @@ from zbridge.views.foxglove.outbox import ViewerOutbox
 from zbridge.views.foxglove.requests import ClientChannel, ServiceCall
 from zbridge.views.foxglove.source import ViewerSource
 
-log = logging.getLogger("zbridge.foxglove")
+log = Log("zbridge.foxglove")
 
 RATE_HZ = 500.0
 """Most messages a second of one viewer; one that sends more is closed."""
@@ -169,7 +169,7 @@ class Viewer:
     def refuse(self, why: Exception) -> None:
         """Count what was not carried out, and tell the person."""
         self.counts["refused"] += 1
-        log.debug("%s: %s", self.name, why)
+        log.debug("viewer_refused", "{session}: {reason}", session=self.name, reason=why)
         self.warn(str(why))
 
     def _handle(self, message: str | bytes) -> None:
@@ -285,7 +285,7 @@ class Viewer:
         try:
             await self._source.commands.left(self)
         except Exception as error:  # the others must continue
-            log.error("%s left: %s", self.name, describe(error))
+            log.error("viewer_leave_failed", "{session} left: {error}", session=self.name, error=describe(error))
 
 
 _HANDLERS: Mapping[type, Callable[[Viewer, Any], object]] = {

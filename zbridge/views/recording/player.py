@@ -7,17 +7,17 @@ at once. A pause moves all that follows by its length.
 
 from __future__ import annotations
 
-import logging
 import math
 import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
 
+from zbridge.log import Log
 from zbridge.views.recording.reader import RecordedMessage, RecordingReader, open_recording
 from zbridge.views.recording.selection import Selection
 
-log = logging.getLogger("zbridge.views.recording")
+log = Log("zbridge.views.recording")
 
 POLL_S = 0.05
 """Longest sleep between two checks for a pause or an end."""
@@ -142,7 +142,7 @@ class Player:
                 if self._closing or not self._loop or self.played == before:
                     return
         except Exception as error:
-            log.exception("the replay failed")
+            log.exception("replay_failed", "the replay failed")
             fault = f"{type(error).__name__}: {error}"
         finally:
             self._ended(fault)

@@ -9,7 +9,6 @@ are ended with what they hold, ``error`` says why, and what still arrives is cou
 from __future__ import annotations
 
 import contextlib
-import logging
 import threading
 import time
 from collections import OrderedDict
@@ -22,11 +21,12 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, Status
 from zbridge.fleet.topics import Delivery, Topic, split_key
+from zbridge.log import Log
 from zbridge.views.recording.contents import SENT, ChannelKind, Pictures, Sent, channel_of, read_sender
 from zbridge.views.recording.intake import Arrival, Intake, Losses
 from zbridge.views.recording.tape import CHANNELS, Tape
 
-log = logging.getLogger("zbridge.views.recording")
+log = Log("zbridge.views.recording")
 
 PAUSE_S = 0.05
 """Seconds between two reads of the intake."""
@@ -140,7 +140,7 @@ class Recorder:
         except OSError as error:
             self._give_up(error.strerror or str(error))
         except Exception as error:
-            log.exception("the recording failed")
+            log.exception("recording_failed", "the recording failed")
             self._give_up(f"{type(error).__name__}: {error}")
 
     def _write_batch(self, batch: list[Arrival]) -> None:

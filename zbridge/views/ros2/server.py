@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 from collections.abc import Callable
 
 from zbridge.bus import Bus, BusSettings, open_bus
 from zbridge.bus.tls.files import own_name
 from zbridge.errors import BusError, ConfigError
 from zbridge.fleet.topics import KeySpace
+from zbridge.log import Log
 from zbridge.metrics import Metrics
 from zbridge.ros2.rmw_zenoh import ros_name
 from zbridge.ros2.types import types_of
@@ -20,7 +20,7 @@ from zbridge.views.ros2.node import RobotNode
 from zbridge.views.ros2.outlets import RosSide
 from zbridge.views.ros2.settings import Ros2Plan
 
-log = logging.getLogger("zbridge.ros2")
+log = Log("zbridge.ros2")
 
 HIDDEN_AFTER_S = 2.0
 """A robot whose gateway is away for less keeps its node."""
@@ -85,7 +85,7 @@ class View:
 
     def _on_connected(self, up: bool) -> None:
         if not up:
-            log.warning("ROS's router is gone: robots driven from ROS are stopped")
+            log.warning("ros_router_lost", "ROS's router is gone: robots driven from ROS are stopped")
         for node in self.nodes.values():
             if node.teleop is not None:
                 node.teleop.connected(up)
@@ -104,11 +104,11 @@ class View:
         if taken is not None or len(self.nodes) >= ROBOTS:
             self._left_out.value += 1
             why = f"its name in ROS is {taken}'s" if taken is not None else f"more than {ROBOTS} robots"
-            log.warning("%s is not shown: %s", robot, why)
+            log.warning("robot_not_shown", "{robot} is not shown: {reason}", robot=robot, reason=why)
             return
         keys, plan = KeySpace(self._plan.realm, robot), self._plan
         self.nodes[robot] = RobotNode(self._side, self._fleet, keys, plan.body(robot), drive=plan.drive, own=self._own)
-        log.info("%s is %s", robot, self.nodes[robot].node.full_name)
+        log.info("robot_shown", "{robot} is {node}", robot=robot, node=self.nodes[robot].node.full_name)
 
     def _hide(self, robot: str) -> None:
         self._leaving.pop(robot, None)
@@ -119,4 +119,4 @@ class View:
     async def _close(self, node: RobotNode) -> None:
         with contextlib.suppress(BusError):
             await node.close()
-        log.info("%s is gone", node.robot)
+        log.info("robot_hidden", "{robot} is gone", robot=node.robot)

@@ -9,7 +9,7 @@ import msgspec
 from msgspec import inspect
 
 from docs.generate.declared import fields, meanings, summary, table
-from zbridge.app.config import MetricsSettings, RobotSettings
+from zbridge.app.config import LogSettings, MetricsSettings, RobotSettings
 from zbridge.app.templates import listener_template, robot_template
 from zbridge.bus import BusSettings, Tls
 from zbridge.camera.settings import CameraSettings
@@ -103,7 +103,7 @@ def robot_file() -> str:
     parts = (
         ("[robot]", RobotSettings), ("[device]", DeviceSettings), ("[[hq]]", HqSettings), ("[hq.tls]", ListenerTls),
         ("[camera]", CameraSettings), ("[bus]", BusSettings), ("[bus.tls]", Tls), ("[control]", ControlSettings),
-        ("[metrics]", MetricsSettings),
+        ("[metrics]", MetricsSettings), ("[log]", LogSettings),
     )  # fmt: skip
     return "\n".join(settings(name, struct, told) for name, struct in parts)
 
@@ -112,10 +112,11 @@ def sections() -> dict[str, str]:
     """Return every generated part of the page by its name."""
     router = commented((DEPLOY / "zenoh" / "router.toml").read_text(), "router")
     router |= {("router.toml", key): text for (place, key), text in router.items() if place == "router"}
+    host = commented((DEPLOY / "config" / "host.toml").read_text())
     return {
         "robot file": robot_file(),
         "options": "\n".join(options(find_protocol(name)) for name in protocol_names()),
-        "host file": settings("[host]", HostSettings, commented((DEPLOY / "config" / "host.toml").read_text())),
+        "host file": settings("[host]", HostSettings, host) + "\n" + settings("[log]", LogSettings, host),
         "router file": settings("router.toml", RouterSettings, router).replace("`[router.", "`["),
         "ros2 file": settings("ros2.toml", Ros2Settings, {}).replace("`[ros2.", "`["),
     }

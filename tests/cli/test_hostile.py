@@ -20,9 +20,9 @@ from rich.console import Console
 from tests.fake_bus import FakeBus
 from zbridge import cli
 from zbridge.bus import Answer, Bus, Sample
-from zbridge.cli import LineFormatter
 from zbridge.cli.demo import LiveTable
 from zbridge.cli.drive import DriveRun
+from zbridge.cli.log_lines import LineFormatter
 from zbridge.errors import LeaseLost
 from zbridge.fleet import topics
 
@@ -205,12 +205,12 @@ def test_the_table_of_the_demo() -> None:
 def logged(message: str, *values: object, error: BaseException | None = None) -> str:
     failed = (type(error), error, None) if error is not None else None
     record = logging.LogRecord(EVIL, logging.WARNING, __file__, 1, message, values, failed)  # type: ignore[arg-type]
-    return LineFormatter("%(levelname)s %(name)s: %(message)s").format(record)
+    return LineFormatter().format(record)
 
 
 def test_a_line_of_the_log_stays_one_line_a_traceback_keeps_its_lines_and_both_harm_nobody() -> None:
     line = logged("%s: %s", EVIL, "x" * 10**6)
-    assert line.startswith("WARNING [/x]")
+    assert " WARNING [/x]" in line
     assert line.count("\n") == 0
     assert len(line) <= 2000
     text = logged("a handler failed", error=ExceptionGroup(EVIL, [ValueError(EVIL)]))

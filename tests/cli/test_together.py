@@ -8,11 +8,11 @@ import pytest
 
 from zbridge import cli
 from zbridge.errors import ConfigError
-from zbridge.host.settings import HostSettings
+from zbridge.host.settings import HostFile, HostSettings
 from zbridge.host.together import Together
 
 ROBOT = '[robot]\nname = "{0}"\n[device]\nprotocol = "tcpudp"\nconnect = ["tcp://{0}.test:1"]\n{1}'
-HOST = HostSettings(together=True)
+HOST = HostFile(HostSettings(together=True))
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from typing import Any
 
 from zbridge.app import plan
 from zbridge.errors import ConfigError
-from zbridge.host.settings import HostSettings
+from zbridge.host.settings import HostFile
 from zbridge.protocol.plugin import find_protocol, protocol_names
 from zbridge.security.router_settings import RouterSettings
 from zbridge.toml import convert
@@ -23,8 +23,8 @@ def check(raw: dict[str, Any], name: str, *, whole: bool) -> None:
     """Raise ConfigError if the product would refuse these tables. name: of the file."""
     if OTHERS & set(raw):
         return
-    if "host" in raw:
-        convert(raw["host"], HostSettings, "host.")
+    if "host" in raw or name == "host.toml":
+        convert(raw, HostFile)
     elif name == "ros2.toml":
         convert(raw, Ros2Settings)
     elif {"roles", "limits", "listen"} & set(raw):

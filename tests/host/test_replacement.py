@@ -18,7 +18,7 @@ from zbridge.errors import HandoverError, NotReady
 from zbridge.host import fork_server, replacement
 from zbridge.host import supervisor as module
 from zbridge.host.deposit import Deposit
-from zbridge.host.fd_channel import Deposited, FdChannel, Forked, Heartbeat, Opened, Rehearse, Shared, in_memory
+from zbridge.host.fd_channel import Deposited, FdChannel, Fork, Forked, Heartbeat, Opened, Rehearse, Shared, in_memory
 from zbridge.host.files import Changes, Follower, RobotFile
 from zbridge.host.fork_client import ForkClient
 from zbridge.host.fork_server import serve
@@ -160,7 +160,7 @@ async def test_a_process_is_known_as_before_with_its_page_its_kept_state_and_the
 
 
 def runner() -> Runner:
-    return Runner(FILE, ForkClient(["false"]), verbose=False, changed=lambda: None)
+    return Runner(FILE, ForkClient(["false"]), Fork("", ""), changed=lambda: None)
 
 
 @pytest.fixture

@@ -17,7 +17,17 @@ from zbridge.app.handover.channel import VERSION, EndError, Go, HandoverChannel,
 from zbridge.errors import NotReady
 from zbridge.host import duplicates, succession
 from zbridge.host import runner as module
-from zbridge.host.fd_channel import Deposited, FdChannel, Heartbeat, Opened, Shared, Started, Succeeded, WantSuccessor
+from zbridge.host.fd_channel import (
+    Deposited,
+    FdChannel,
+    Fork,
+    Heartbeat,
+    Opened,
+    Shared,
+    Started,
+    Succeeded,
+    WantSuccessor,
+)
 from zbridge.host.files import RobotFile, check
 from zbridge.host.memory import MemoryWriter
 from zbridge.host.process import GatewayProcess
@@ -136,10 +146,10 @@ class Scene:
         self.stream, self.robot = socket.socketpair()
         self.robot.setblocking(False)
         monkeypatch.setattr(module, "Launcher", self._launch)
-        self.runner = Runner(file, None, verbose=False, changed=lambda: None)  # type: ignore[arg-type]
+        self.runner = Runner(file, None, Fork("", ""), changed=lambda: None)  # type: ignore[arg-type]
         self._tasks = [asyncio.ensure_future(self.runner.run()), asyncio.ensure_future(self._reap())]
 
-    def _launch(self, _: object, make: Make, *, verbose: bool) -> PlayedLauncher:
+    def _launch(self, _: object, make: Make, request: Fork) -> PlayedLauncher:
         self.launcher = PlayedLauncher(make, self.stream)
         return self.launcher
 

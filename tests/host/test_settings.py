@@ -5,8 +5,16 @@ from pathlib import Path
 import pytest
 
 from zbridge.app import plan
+from zbridge.app.config import LogSettings
 from zbridge.errors import ConfigError
-from zbridge.host.settings import HostSettings, load_host, require_different_robots, require_one_bus, robot_files
+from zbridge.host.settings import (
+    HostFile,
+    HostSettings,
+    load_host,
+    require_different_robots,
+    require_one_bus,
+    robot_files,
+)
 
 
 def robot(name: str, port: int = 0, **tables: object) -> tuple[Path, object]:
@@ -19,14 +27,14 @@ def robot(name: str, port: int = 0, **tables: object) -> tuple[Path, object]:
 
 
 def test_a_directory_without_a_host_file_has_the_defaults(tmp_path: Path) -> None:
-    assert load_host(tmp_path) == HostSettings()
+    assert load_host(tmp_path).host == HostSettings()
 
 
 def test_the_host_file_is_read_and_is_no_robots(tmp_path: Path) -> None:
     (tmp_path / "host.toml").write_text("[host]\ntogether = true\nstagger_s = 0.1\n")
     for name in ("b.toml", "a.toml", "notes.txt"):
         (tmp_path / name).touch()
-    assert load_host(tmp_path) == HostSettings(together=True, stagger_s=0.1)
+    assert load_host(tmp_path).host == HostSettings(together=True, stagger_s=0.1)
     assert [path.name for path in robot_files(tmp_path)] == ["a.toml", "b.toml"]
 
 
@@ -85,6 +93,6 @@ def test_robots_that_share_a_session_have_one_bus() -> None:
 def test_the_documented_file_has_the_defaults(tmp_path: Path) -> None:
     documented = Path(__file__).parents[2] / "deploy" / "config" / "host.toml"
     (tmp_path / "host.toml").write_text(documented.read_text())
-    assert load_host(tmp_path) == HostSettings()
-    for field in HostSettings.__struct_fields__:
+    assert load_host(tmp_path) == HostFile()
+    for field in (*HostSettings.__struct_fields__, *(f"# {name}" for name in LogSettings.__struct_fields__)):
         assert f"\n{field} = " in documented.read_text()

@@ -39,7 +39,7 @@ def made(pid: int, channel: FdChannel, file: RobotFile) -> Any:
 
 
 def launcher(forks: ForkClient) -> Launcher:
-    return Launcher(forks, made, verbose=True)  # type: ignore[arg-type]
+    return Launcher(forks, made, Fork("", "", verbose=True, log_format="json"))  # type: ignore[arg-type]
 
 
 async def test_a_process_is_forked_with_its_file_its_post_and_what_it_takes_over(tmp_path: Path) -> None:
@@ -47,7 +47,7 @@ async def test_a_process_is_forked_with_its_file_its_post_and_what_it_takes_over
     path.write_text("changed meanwhile")
     file = RobotFile(path, b"as it was checked", ("fleet", "r1"))
     started: Any = await launcher(forks).start(file, 5, at_once=True)
-    assert forks.asked == [(Fork(str(path), "r1", True), b"as it was checked", 5, True)]
+    assert forks.asked == [(Fork(str(path), "r1", True, "json"), b"as it was checked", 5, True)]
     pid, channel, of = started
     assert (pid, of) == (7, file)
     assert os.read(channel.fileno(), 10) == b"here", "the far end is the process's"

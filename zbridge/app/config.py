@@ -12,7 +12,7 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 from ssl import SSLContext
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 
@@ -49,6 +49,20 @@ class MetricsSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     listen: str
 
 
+class LogSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[log]``: what the process writes to stderr.
+
+    format: lines for people, or a JSON object a line. level: the least that is written.
+    """
+
+    format: Literal["console", "json"] | None = None
+    level: Literal["debug", "info", "warning", "error"] | None = None
+
+    def over(self, other: LogSettings | None) -> LogSettings:
+        """Return these settings; where they say nothing, the other's."""
+        return LogSettings(self.format or other.format, self.level or other.level) if other is not None else self
+
+
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A whole configuration."""
 
@@ -58,6 +72,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     bus: BusSettings = BusSettings()
     control: ControlSettings = ControlSettings()
     metrics: MetricsSettings | None = None
+    log: LogSettings = LogSettings()
     camera: CameraSettings | None = None
 
 

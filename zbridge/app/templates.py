@@ -38,7 +38,8 @@ def listener_template(protocol: Protocol) -> str:
     head = "# A listener for HQ programs of one robot. Start it with: zbridge run FILE\n\n"
     listen, heading, options = protocol.hq_template.partition("[hq.options]")
     return (
-        f"{head}{ROBOT_TEMPLATE}[[hq]]\n{listen}{LISTENER_TEMPLATE}{heading}{options}\n{BUS_TEMPLATE}{METRICS_TEMPLATE}"
+        f"{head}{ROBOT_TEMPLATE}[[hq]]\n{listen}{LISTENER_TEMPLATE}{heading}{options}\n{BUS_TEMPLATE}"
+        f"{METRICS_TEMPLATE}{LOG_TEMPLATE}"
     )
 
 
@@ -48,6 +49,11 @@ SHARED_TEMPLATE = """\
 METRICS_TEMPLATE = """\
 # [metrics]
 # listen = "127.0.0.1:9100"             # counters for Prometheus
+"""
+LOG_TEMPLATE = """
+# [log]                                 # on stderr: docs/how-to/logs.md
+# format = "console"                    # lines for people; "json": one object a line, for programs
+# level = "info"                        # the least that is written: debug, info, warning, error
 """
 LISTENER_TEMPLATE = """\
 # name = "desk"                         # of the listener on the bus; left out: from its protocol and the process
@@ -122,4 +128,5 @@ audit_days = 30.0                       # further ones are kept until they are s
 
 """
     + METRICS_TEMPLATE
+    + LOG_TEMPLATE
 )

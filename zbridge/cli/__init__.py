@@ -7,7 +7,8 @@ Knows no protocol. Only this package imports typer, and this module does not: ``
 rich. ``app`` declares the commands; ``certs``, ``doctor``, ``new_protocol``, ``robot_commands`` and
 ``recording_commands`` declare groups of them. ``bus``, ``check``, ``demo`` (with ``demo_bus``), ``diagnosis``,
 ``drive``, ``echo``, ``gateway_commands``, ``probe``, ``recording``, ``router``, ``simulate``, ``supervise``, ``top``
-and ``viewers`` implement them; ``terminal`` prints lines and tables. ``keyboard`` converts keys to drives;
+and ``viewers`` implement them; ``terminal`` prints lines and tables, ``logs`` (with ``log_lines`` and ``log_folding``)
+the log. ``keyboard`` converts keys to drives;
 ``fork_server`` forks the gateways of ``zbridge run DIR``. Exit codes: ``commands.md``.
 """
 
@@ -29,17 +30,21 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from zbridge.app import Gateway, load, until_signal
 from zbridge.app.handover import Spawn
 from zbridge.bus.tls.files import TLS_VARIABLE
+from zbridge.cli.logs import last_words
+from zbridge.cli.logs import set_up_log as set_up_log
 from zbridge.errors import ConfigError, ZbridgeError, describe
-from zbridge.fleet.printable import shown
 from zbridge.host.addresses import hold_addresses
-from zbridge.host.settings import HostSettings, require_different_robots, require_one_bus
+from zbridge.host.settings import HostFile, require_different_robots, require_one_bus
 from zbridge.host.together import Together
+from zbridge.log import Log
 from zbridge.security.member import check_member
 from zbridge.toml import prefixed, read_file
 
 if TYPE_CHECKING:  # loaded only under a supervisor
-    from zbridge.app.config import GatewayPlan
+    from zbridge.app.config import GatewayPlan, LogSettings
     from zbridge.host.child import Reporter
+
+log = Log("zbridge.cli")
 
 
 def main() -> None:
@@ -116,16 +121,19 @@ def run_gateway(
     take_over: int | None = None,
     reporter: Reporter | None = None,
     content: bytes | None = None,
+    host_log: LogSettings | None = None,
 ) -> None:
     """Run the gateway of a configuration until SIGTERM or SIGINT, or until a successor has taken it over.
 
     content: of the file, if it was read already. tls: a folder, for a file without ``bus.tls``. take_over: the
     descriptor of the channel to the gateway that hands over to this process. reporter: reports to the supervisor, if
-    there is one, which then also starts successors.
+    there is one, which then also starts successors. host_log: for a file that says nothing of it.
     """
     if reporter is None:
         set_up_log(verbose=verbose)
     plan = load(file, tls=tls, content=content)
+    settings, robot = plan.config.log.over(host_log), plan.config.robot.name
+    set_up_log(verbose=verbose, robot=robot, labelled=reporter is not None, settings=settings)
     hand_on_tls(tls)
     with prefixed(f"{file}: "):
         _check(plan, only)
@@ -172,25 +180,27 @@ def hand_on_tls(folder: Path | None) -> None:
         os.environ[TLS_VARIABLE] = str(folder.absolute())
 
 
-def run_together(files: Sequence[Path], host: HostSettings, *, verbose: bool = False) -> None:
+def run_together(files: Sequence[Path], host: HostFile, *, verbose: bool = False) -> None:
     """Run the gateways of several configurations in this process until SIGTERM or SIGINT.
 
-    A faulty file is reported, and the others run.
+    A faulty file is reported, and the others run. They have one log: as ``host`` says, else as the files agree.
     """
-    set_up_log(verbose=verbose)
+    set_up_log(verbose=verbose, settings=host.log)
     plans, faults = [], []
     for file in files:
         try:
-            plans.append((file, load(file, content=read_file(file, host.file_bytes))))
+            plans.append((file, load(file, content=read_file(file, host.host.file_bytes))))
         except ConfigError as error:
             faults.append(error)
-            logging.getLogger("zbridge.cli").error("%s", error)
+            log.error("file_not_run", "{reason}", reason=error, file=file)
     if not plans:
         raise faults[0]
+    if len(wishes := {plan.config.log for _, plan in plans}) == 1:
+        set_up_log(verbose=verbose, settings=host.log.over(*wishes))
     require_different_robots(plans)
     require_one_bus(plans)
     gc.freeze()
-    together = Together({plan.config.robot.name: plan for _, plan in plans}, host)
+    together = Together({plan.config.robot.name: plan for _, plan in plans}, host.host)
     run_loop(until_signal(together.run()))
     _exit(left=together.left)
 
@@ -206,32 +216,14 @@ def run_loop(work: Coroutine[Any, Any, Any]) -> Any:
 
 def run_command(work: Coroutine[Any, Any, bool | int | None], *, level: int = logging.ERROR) -> None:
     """Set up logging, and run a coroutine; end the process with the code that it returns, False being 1."""
-    set_up_log(verbose=False, level=level)
+    set_up_log(level=level)
     result = run_loop(work)
     code = int(not result) if isinstance(result, bool) else result
     if code:
         sys.exit(code)
 
 
-def set_up_log(*, verbose: bool, level: int = logging.INFO, robot: str = "") -> None:
-    """Log to stderr from ``level`` on; ``verbose`` logs every frame. ``robot``: stands in every line, if given."""
-    handler = logging.StreamHandler(sys.stderr)
-    whose = f"{robot.replace('%', '%%')}: " if robot else ""
-    handler.setFormatter(LineFormatter(f"%(asctime)s %(levelname)-7s {whose}%(name)s: %(message)s"))
-    logging.basicConfig(level=logging.DEBUG if verbose else level, handlers=[handler])
-
-
-class LineFormatter(logging.Formatter):
-    """Formats a record as one line that is safe to print, whatever peers sent; a traceback follows on further lines."""
-
-    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - the library's names
-        return shown(super().formatMessage(record))
-
-    def formatException(self, ei: Any) -> str:  # noqa: N802
-        return "\n".join(map(shown, super().formatException(ei).split("\n")))
-
-
 def give_up(code: int, text: object) -> NoReturn:
     """End the process with one line on stderr."""
-    print(f"zbridge: {shown(text)}", file=sys.stderr)  # noqa: T201
+    print(last_words(code, text), file=sys.stderr)  # noqa: T201
     sys.exit(code)

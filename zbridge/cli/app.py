@@ -27,7 +27,7 @@ from zbridge.cli import (
 from zbridge.cli.options import Connect, FileTls, Json, Realm, TlsFolder, check_name
 from zbridge.client import bus_settings
 from zbridge.errors import LinkError
-from zbridge.host.settings import HostSettings, load_host, robot_files
+from zbridge.host.settings import HostFile, load_host, robot_files
 from zbridge.protocol.plugin import find_protocol, protocol_names
 from zbridge.toml import prefixed
 from zbridge.version import __version__
@@ -115,12 +115,12 @@ def run(
     restarts gateways that die or hang, and stops their robots; at SIGHUP it reads the files and the installed code
     again. One FILE without --watch is not monitored.
     """
-    host = load_host(files[0]) if len(files) == 1 and files[0].is_dir() else HostSettings()
-    if together or host.together:
+    found = load_host(files[0]) if len(files) == 1 and files[0].is_dir() else HostFile()
+    if together or found.host.together:
         if watch:
             give_up(2, "--watch: not with --together, which does not follow files")
         hand_on_tls(tls)
-        run_together(_robot_files(files), host, verbose=verbose)
+        run_together(_robot_files(files), found, verbose=verbose)
     elif len(files) == 1 and not files[0].is_dir() and not watch:
         run_gateway(files[0], verbose=verbose, tls=tls, take_over=take_over if take_over >= 0 else None)
     else:
@@ -294,7 +294,7 @@ def router(
     """Run a Zenoh router in the foreground until SIGTERM or SIGINT; with tls, roles limit what members may do."""
     from zbridge.cli.router import run_router
 
-    set_up_log(verbose=False)
+    set_up_log()
     given: dict[str, object] = {
         "listen": listen,
         "connect": connect,

@@ -119,7 +119,7 @@ def _check_directory(directory: Path, tls: Path | None) -> list[Checked]:
     if (directory / HOST_FILE).exists():
         results.append(Checked(str(directory / HOST_FILE)))
         try:
-            host = load_host(directory)
+            host = load_host(directory).host
         except ConfigError as error:
             results[0].error = str(error)
     files = [read(path, host.file_bytes) for path in robot_files(directory)]

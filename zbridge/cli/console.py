@@ -58,7 +58,7 @@ def console(
         return
     from zbridge.cli.viewers import run_console
 
-    set_up_log(verbose=False)
+    set_up_log()
     given = {name: value for name, value in locals().items() if name != "context"} | {"host": host or []}
     run_console(bus_settings(connect, tls), realm, given)
 

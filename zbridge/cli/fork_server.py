@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from pathlib import Path
 
 from zbridge.cli import give_up, run_gateway, set_up_log
+from zbridge.cli.logs import log_settings
 from zbridge.errors import ConfigError, ZbridgeError
 from zbridge.host.child import Reporter
 from zbridge.host.fd_channel import FdChannel
@@ -20,7 +22,8 @@ def main() -> None:
 def run(birth: Birth) -> int:
     """Be a gateway; return the exit code."""
     request = birth.request
-    set_up_log(verbose=request.verbose, robot=request.robot)
+    settings = log_settings(request.log_format, request.log_level)
+    set_up_log(verbose=request.verbose, robot=request.robot, labelled=True, settings=settings)
     try:
         run_gateway(
             Path(request.file),
@@ -28,12 +31,15 @@ def run(birth: Birth) -> int:
             verbose=request.verbose,
             take_over=birth.take_over if birth.take_over >= 0 else None,
             reporter=Reporter(FdChannel.inherited(birth.channel), hands_over=True),
+            host_log=settings,
         )
     except ZbridgeError as error:
         try:
             give_up(2, error)
         except SystemExit:
             return 2 if isinstance(error, ConfigError) else 1
+    finally:
+        logging.shutdown()  # the process ends without Python's own end
     return 0
 
 

@@ -38,12 +38,13 @@ from zbridge.host.fd_channel import (
     close_all,
 )
 from zbridge.host.memory import DEPOSIT_BYTES, PARTIAL_BYTES, SLOTS, MemoryWriter, slot_of
+from zbridge.log import Log
 from zbridge.protocol.kept import Budget
 from zbridge.robot.connection import Resume
 from zbridge.robot.observer import LastStop, ObservedRobot, Observer
 from zbridge.transport import Link, Parcel
 
-log = logging.getLogger("zbridge.host")
+log = Log("zbridge.host")
 
 HEARTBEAT_S = 1.0
 """Seconds between two heartbeats."""
@@ -252,7 +253,7 @@ class Reporter(Observer):
             self._announced, self._deposited = announcement, data
             if announcement.sockets:
                 self._memory.commit(announcement.area)
-        self._log_missing(missing, why, logging.INFO if data else logging.WARNING)
+        self._log_missing(missing, why, lost=not data)
 
     def _exported(self, parcel: Parcel) -> tuple[bytes, str, str]:
         """Describe what a successor needs, b"" for nothing; say what is missing, and why.
@@ -272,11 +273,12 @@ class Reporter(Observer):
         sizes = ", ".join(str(budget.left_out[name]) for name in names)
         return data, missing, f"{sizes} bytes, more than {VALUE_BYTES}"
 
-    def _log_missing(self, what: str, why: str, level: int) -> None:
+    def _log_missing(self, what: str, why: str, *, lost: bool) -> None:
         now, (logged, at) = self._loop.time(), self._missing_logged
         if what and what != logged and now >= at + LOG_S:
             self._missing_logged = (what, now)
-            log.log(level, "%s: %s", what, why)
+            level = logging.WARNING if lost else logging.INFO
+            log.log(level, "deposit_incomplete", "{what}: {reason}", what=what, reason=why)
 
     def _next_number(self) -> int:
         """Choose the number of a new link: one that was not used lately, with a slot of its own."""
@@ -300,7 +302,7 @@ class Reporter(Observer):
             return
         if received is None:
             self._loop.remove_reader(self._channel.fileno())
-            log.warning("the supervisor is gone: this gateway ends")
+            log.warning("supervisor_gone", "the supervisor is gone: this gateway ends")
             os.kill(os.getpid(), signal.SIGTERM)
             return
         message, descriptors = received

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import os
 import socket
 import stat
@@ -18,9 +17,10 @@ import msgspec
 
 from zbridge.host.fd_channel import close_all
 from zbridge.host.memory import SLOTS
+from zbridge.log import Log
 from zbridge.robot.observer import Boundary, LastStop
 
-log = logging.getLogger("zbridge.host")
+log = Log("zbridge.host")
 
 TIMES = 4
 """So often a stop is written: legacy robots lose what they read together with something else."""
@@ -83,7 +83,7 @@ class Duplicate(msgspec.Struct):
                 # To where the stream leads: a robot takes datagrams at the same address and port.
                 return own.sendto(data, socket.MSG_DONTWAIT, robot.getpeername()) == len(data)
         except OSError as error:
-            log.debug("%s: no stop written: %s", self.name, error)
+            log.debug("stop_not_written", "{link}: no stop written: {error}", link=self.name, error=error)
             return False
 
 

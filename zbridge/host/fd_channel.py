@@ -92,12 +92,14 @@ class Fork(msgspec.Struct, frozen=True, tag="fork"):
     """Fork a gateway.
 
     Descriptors come along: its end of the channel, the content of its file, and the socket from which it takes over, if
-    it does.
+    it does. log_format, log_level: of its log, unless its file says it; empty: not said.
     """
 
     file: str
     robot: str
     verbose: bool = False
+    log_format: str = ""
+    log_level: str = ""
 
 
 class Forked(msgspec.Struct, frozen=True, tag="forked"):

@@ -9,7 +9,6 @@ keep the supervisor from stopping the robot of a gateway that died.
 
 from __future__ import annotations
 
-import logging
 import math
 import time
 from collections.abc import Iterable, Mapping
@@ -22,10 +21,11 @@ from zbridge.errors import ConfigError, describe
 from zbridge.fleet.printable import shown
 from zbridge.host.addresses import Addresses, resolve
 from zbridge.host.settings import robot_files
+from zbridge.log import Log
 from zbridge.protocol.address import DeviceAddress
 from zbridge.toml import FILE_BYTES, read_file
 
-log = logging.getLogger("zbridge.host")
+log = Log("zbridge.host")
 
 CHECK_AGAIN_S = 30.0
 """Seconds until a faulty file that is the same is checked again: a certificate that it names may be there now."""
@@ -89,7 +89,7 @@ def check(path: Path, content: bytes) -> RobotFile:
     except ConfigError as error:
         return RobotFile(path, content, fault=shown(str(error)))
     except Exception as error:  # whatever a check meets, the other files are followed
-        log.exception("%s: not checked", path)
+        log.exception("file_not_checked", "{file}: not checked", file=path)
         return RobotFile(path, content, fault=f"{path}: {describe(error)}")
     robot, device = plan.config.robot, plan.device
     connect, shares = (device.addresses, device.shares) if device is not None else ((), False)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hashlib
-import logging
 import math
 import os
 import signal
@@ -20,9 +19,10 @@ from pathlib import Path
 from zbridge.errors import NotReady
 from zbridge.host.fd_channel import FdChannel, Fork, Forked, Message, Ready, Rehearse, close_all, in_memory
 from zbridge.host.replacement import ServerState
+from zbridge.log import Log
 from zbridge.protocol.plugin import GROUP
 
-log = logging.getLogger("zbridge.host")
+log = Log("zbridge.host")
 
 HOME = Path(__file__).parents[1]
 """The folder of zbridge's code."""
@@ -229,14 +229,14 @@ class ForkClient:
             self.unsettled = stamp != old.state.stamp and not settled
             if stamp in (old.state.stamp, self._refused) or not settled:
                 return old
-            log.info("the installed code has changed: loading it")
+            log.info("code_changed", "the installed code has changed: loading it")
         try:
             self._server, self._refused = await _Server.start(self._command, stamp), None
         except NotReady as error:
             if old is None or not old.alive:
                 raise
             self._refused = stamp
-            log.error("%s: the old code continues", error)
+            log.error("code_not_loaded", "{error}: the old code continues", error=error)
             return old
         if old is not None:
             old.kill()

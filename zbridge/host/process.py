@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import os
 import signal
 import socket
@@ -28,9 +27,10 @@ from zbridge.host.fd_channel import (
 from zbridge.host.files import RobotFile
 from zbridge.host.replacement import ProcessState
 from zbridge.host.watchdog import Watchdog
+from zbridge.log import Log
 from zbridge.robot.observer import LastStop
 
-log = logging.getLogger("zbridge.host")
+log = Log("zbridge.host")
 
 KILLED_S = 0.05
 """Longest wait for the end of a process that was killed, before its robot is stopped."""
@@ -139,7 +139,8 @@ class GatewayProcess:
             except BlockingIOError:
                 return False
             except ValueError as error:
-                log.error("process %d sent an invalid message: %s", self.pid, error)
+                template = "process {pid} sent an invalid message: {error}"
+                log.error("invalid_report", template, pid=self.pid, error=error, robot=self.file.robot)
                 continue
             except OSError:  # closed
                 return False

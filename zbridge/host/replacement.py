@@ -13,6 +13,7 @@ sockets. Signals wait too: they are blocked until the installed code takes them.
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
 import signal
 from collections.abc import Awaitable, Callable, Sequence
@@ -74,14 +75,16 @@ class ServerState(msgspec.Struct, frozen=True):
 class SupervisorState(msgspec.Struct, frozen=True, tag_field="version", tag=VERSION):
     """What a supervisor runs; in place of other code also what that code knew.
 
-    at: the time of the replacement, None: this supervisor was just started. is_ready: whether systemd knows that every
-    gateway has begun.
+    log_format, log_level: as in :class:`~zbridge.host.fd_channel.Fork`. at: the time of the replacement, None: this
+    supervisor was just started. is_ready: whether systemd knows that every gateway has begun.
     """
 
     sources: tuple[str, ...]
     watch: bool = False
     verbose: bool = False
     host: HostSettings = HostSettings()
+    log_format: str = ""
+    log_level: str = ""
     at: float | None = None
     is_ready: bool = False
     runners: tuple[RunnerState, ...] = ()
@@ -145,6 +148,7 @@ async def replace(
 
 
 def _execute(command: Sequence[str], state: SupervisorState) -> NoReturn:
+    logging.shutdown()  # what is still counted of repeated warnings is written
     with in_memory("zbridge state", encode(state)) as descriptor:
         for number in (descriptor, *state.descriptors):
             os.set_inheritable(number, True)  # for this exec: every other program is started without them

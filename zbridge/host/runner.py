@@ -28,7 +28,6 @@ A process runs by the content of its file that was checked, never by what the fi
 from __future__ import annotations
 
 import asyncio
-import logging
 import signal
 import socket
 import time
@@ -38,17 +37,18 @@ import msgspec
 
 from zbridge.errors import HandoverError, NotReady
 from zbridge.host.duplicates import PERIOD_S, TIMES
-from zbridge.host.fd_channel import FdChannel
+from zbridge.host.fd_channel import FdChannel, Fork
 from zbridge.host.files import RobotFile
 from zbridge.host.fork_client import ForkClient
 from zbridge.host.process import KILLED_S, GatewayProcess
 from zbridge.host.replacement import RunnerState
 from zbridge.host.succession import GONE_S, Launcher, Succession
 from zbridge.host.watchdog import HEALTHY_S, RestartDelay
+from zbridge.log import Log
 from zbridge.tasks import Tasks, occurs
 from zbridge.toml import FILE_BYTES
 
-log = logging.getLogger("zbridge.host")
+log = Log("zbridge.host")
 
 END_S, ASK_S = 5.0, 5.0
 """Seconds that a process is given to end in order, with its robot's stop, and to ask for its successor."""
@@ -61,24 +61,24 @@ OFFERS = 2
 
 
 class Runner:
-    """Keeps one robot's gateway running. changed: called when :attr:`process` or its state is another one.
+    """Keeps one robot's gateway running. request: as of :class:`Launcher`. most_bytes: of the robot's file.
 
-    most_bytes: of the robot's file.
+    changed: called when :attr:`process` or its state is another one.
     """
 
     def __init__(
         self,
         file: RobotFile,
         forks: ForkClient,
+        request: Fork,
         *,
-        verbose: bool,
         changed: Callable[[], object],
         most_bytes: int = FILE_BYTES,
     ) -> None:
         self.file = file
         self.process: GatewayProcess | None = None
         self.restarts = 0
-        self._launcher = Launcher(forks, self._process, verbose=verbose)
+        self._launcher = Launcher(forks, self._process, request)
         self._changed = changed
         self._most_bytes = most_bytes
         self._restart_delay = RestartDelay()
@@ -145,7 +145,7 @@ class Runner:
             try:
                 self.process = self.process or await self._launcher.start(self.file)
             except NotReady as error:
-                log.error("%s: no process: %s", self.file.robot, error)
+                log.error("no_process", "{robot}: no process: {error}", robot=self.file.robot, error=error)
             else:
                 await self._supervise()
             self._changed()
@@ -203,7 +203,7 @@ class Runner:
     async def _crashed(self, process: GatewayProcess, how: str) -> GatewayProcess | None:
         """Stop the robot of a process that died; give the process that has its connections, None if none has."""
         self._attended.clear()
-        log.error("%s: process %d %s", self.file.robot, process.pid, how)
+        log.error("process_died", "{robot}: process {pid} {how}", robot=self.file.robot, pid=process.pid, how=how)
         await process.deposit.stop(1)  # before anything that may take time
         stopped = asyncio.ensure_future(self._repeat_stop(process))
         await self._succession.give_up()
@@ -234,9 +234,11 @@ class Runner:
                 reason = str(error)
             else:
                 self._restart_delay.failed(process.lived_s)
-                log.info("%s: process %d continues with its connections", self.file.robot, successor.pid)
+                template = "{robot}: process {pid} continues with its connections"
+                log.info("connections_inherited", template, robot=self.file.robot, pid=successor.pid)
                 return successor
-        log.error("%s: its connections are lost: %s", self.file.robot, reason)
+        template = "{robot}: its connections are lost: {reason}"
+        log.error("connections_lost", template, robot=self.file.robot, reason=reason)
         return None
 
     def _promote_successor(self, process: GatewayProcess) -> bool:
@@ -249,7 +251,7 @@ class Runner:
         process.hand_deposit_to(successor)
         self.process = successor
         self.file = msgspec.structs.replace(successor.file, path=self.file.path)  # it may have been renamed meanwhile
-        log.info("%s: process %d serves it now", self.file.robot, successor.pid)
+        log.info("process_took_over", "{robot}: process {pid} serves it now", robot=self.file.robot, pid=successor.pid)
         self._former.add(process)
         self._tasks.start(self._await_end(process))
         return True
@@ -267,7 +269,7 @@ class Runner:
         if took is not None:
             moved = "it was driven" if process.last.driven else "it was not driven"
             what = "the robot was sent its stop" if took else "the robot's link is stalled: no stop was written"
-            log.warning("%s: %s: %s", self.file.robot, what, moved)
+            log.warning("robot_stopped", "{robot}: {what}: {driven}", robot=self.file.robot, what=what, driven=moved)
 
     async def _end(self, process: GatewayProcess) -> None:
         process.asked_to_end = True
@@ -277,7 +279,8 @@ class Runner:
     async def _gone(self, process: GatewayProcess) -> None:
         """Wait for the end of a process that ends by itself."""
         if not await process.gone(END_S):
-            log.error("%s: process %d did not end within %g s", self.file.robot, process.pid, END_S)
+            template = "{robot}: process {pid} did not end within {within_s:g} s"
+            log.error("process_hangs", template, robot=self.file.robot, pid=process.pid, within_s=END_S)
             process.kill(f"did not end within {END_S:g} s")
             await process.gone(KILLED_S)
 
@@ -287,7 +290,8 @@ class Runner:
         if not self._now.is_set():
             self.restarts += 1
             delay_s = self._restart_delay.failed(lived_s)
-            log.info("%s: next process in %.1f s", self.file.robot, delay_s)
+            template = "{robot}: next process in {delay_s:.1f} s"
+            log.info("next_process", template, robot=self.file.robot, delay_s=delay_s)
             at += delay_s
         await self._wait_until(at)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import math
 import random
 from collections import Counter
@@ -15,9 +14,10 @@ from zbridge.host.files import Changes, RobotFile
 from zbridge.host.process import GatewayProcess
 from zbridge.host.replacement import RunnerState
 from zbridge.host.runner import Runner
+from zbridge.log import Log
 from zbridge.tasks import Tasks
 
-log = logging.getLogger("zbridge.host")
+log = Log("zbridge.host")
 
 LATE_S = 0.05
 """A check that comes so much later was delayed by the machine."""
@@ -90,13 +90,13 @@ class Runners:
             runner.file = file
         for file in changes.faulty:
             runs = "its robot continues as before" if file.path in self.by_path else "no gateway uses it"
-            log.error("%s: %s", file.fault, runs)
+            log.error("file_faulty", "{reason}: {effect}", reason=file.fault, effect=runs, file=file.path)
             self.faults[file.path] = str(file.fault)
         for path in changes.gone:
-            log.info("%s: was removed: its robot's gateway ends", path)
+            log.info("file_removed", "{file}: was removed: its robot's gateway ends", file=path)
             self._running.start(self._leave(self.by_path.pop(path)))
         for file in changes.changed:
-            log.info("%s: has changed", file.path)
+            log.info("file_changed", "{file}: has changed", file=file.path)
             self.by_path[file.path].restart(file)
         for path in [*changes.gone, *(file.path for file in (*changes.came, *changes.changed))]:
             self.faults.pop(path, None)
@@ -104,7 +104,7 @@ class Runners:
             if number and self._stagger_s:
                 await asyncio.sleep(self._stagger_s * random.uniform(1 - JITTER, 1 + JITTER))
             if not first:
-                log.info("%s: is new", file.path)
+                log.info("file_new", "{file}: is new", file=file.path)
             self._run(file)
         self.all_started = self.all_started or first
         self._changed()
@@ -186,4 +186,4 @@ class Reports:
             self.changed()  # again, later
         elif ready:
             self.is_ready = True
-            log.info("ready: %s", self._runners.status)
+            log.info("supervisor_ready", "ready: {status}", status=self._runners.status)

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import msgspec
 
-from zbridge.app.config import GatewayPlan
+from zbridge.app.config import GatewayPlan, LogSettings
 from zbridge.errors import ConfigError
 from zbridge.host.addresses import Addresses, resolve
 from zbridge.toml import FILE_BYTES, read_struct
@@ -34,14 +34,17 @@ class HostSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     file_bytes: Annotated[int, msgspec.Meta(ge=1000, le=100_000_000)] = FILE_BYTES
 
 
-class _HostFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class HostFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``host.toml``. log: of the supervisor, and of gateways whose files say nothing of it."""
+
     host: HostSettings = HostSettings()
+    log: LogSettings = LogSettings()
 
 
-def load_host(directory: Path) -> HostSettings:
+def load_host(directory: Path) -> HostFile:
     """Read ``host.toml`` of a directory; the defaults where there is none. Raises ConfigError, which names the file."""
     path = directory / HOST_FILE
-    return read_struct(path, _HostFile).host if path.exists() else HostSettings()
+    return read_struct(path, HostFile) if path.exists() else HostFile()
 
 
 def robot_files(directory: Path) -> list[Path]:

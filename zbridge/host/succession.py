@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import socket
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -25,9 +24,10 @@ from zbridge.host.fd_channel import FdChannel, Fork, Started
 from zbridge.host.files import RobotFile, read
 from zbridge.host.fork_client import ForkClient
 from zbridge.host.process import GatewayProcess
+from zbridge.log import Log
 from zbridge.transport import Parcel
 
-log = logging.getLogger("zbridge.host")
+log = Log("zbridge.host")
 
 
 STAT_S = 1.0
@@ -45,12 +45,15 @@ GONE_S = 2.0
 
 
 class Launcher:
-    """Starts processes; ``make`` makes of each what its runner knows."""
+    """Starts processes; ``make`` makes of each what its runner knows.
 
-    def __init__(self, forks: ForkClient, make: Make, *, verbose: bool) -> None:
+    request: what all have in common; file and robot are put in.
+    """
+
+    def __init__(self, forks: ForkClient, make: Make, request: Fork) -> None:
         self._forks = forks
         self._make = make
-        self._verbose = verbose
+        self._request = request
 
     def __repr__(self) -> str:
         return f"<Launcher by {self._forks!r}>"
@@ -66,14 +69,14 @@ class Launcher:
             channel, far = FdChannel.pair()
         except OSError as error:
             raise NotReady(error.strerror or str(error)) from error
-        request = Fork(str(file.path), file.robot, self._verbose)
+        request = msgspec.structs.replace(self._request, file=str(file.path), robot=file.robot)
         try:
             with far:
                 pid = await self._forks.fork(request, far, file.content, take_over, at_once=at_once)
         except NotReady:
             channel.close()
             raise
-        log.info("%s: process %d", file.robot, pid)
+        log.info("process_started", "{robot}: process {pid}", robot=file.robot, pid=pid)
         return self._make(pid, channel, file)
 
 
@@ -126,7 +129,7 @@ class Succession:
                 file = await asyncio.to_thread(read, path, most_bytes)
                 reason = file.fault or await self._forked(process, file, far_end, alone)
         if reason is not None:
-            log.error("%s: no successor: %s", self._robot, reason)
+            log.error("no_successor", "{robot}: no successor: {reason}", robot=self._robot, reason=reason)
             self._settled.set()
         process.channel.send(Started(reason))
 
@@ -151,7 +154,8 @@ class Succession:
         if self.successor is successor and not process.succeeded:
             self.successor = None
             self._settled.set()
-            log.error("%s: process %d did not take over: %s", self._robot, successor.pid, successor.how)
+            template = "{robot}: process {pid} did not take over: {how}"
+            log.error("successor_died", template, robot=self._robot, pid=successor.pid, how=successor.how)
             successor.close()
 
     def take(self) -> GatewayProcess | None:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import asyncio
 import ctypes
-import logging
 import signal
 import time
 from pathlib import Path
@@ -20,14 +19,16 @@ import msgspec
 
 from zbridge.app.handover.processes import Systemd
 from zbridge.errors import ConfigError, HandoverError, NotReady
+from zbridge.host.fd_channel import Fork
 from zbridge.host.files import Follower, RobotFile, compare, read_all
 from zbridge.host.fork_client import ForkClient, module_command
 from zbridge.host.replacement import SIGNALS, SupervisorState, quiet_threads, replace
 from zbridge.host.runner import Runner
 from zbridge.host.runners import Reports, Runners
+from zbridge.log import Log
 from zbridge.tasks import Tasks, occurs
 
-log = logging.getLogger("zbridge.host")
+log = Log("zbridge.host")
 
 WATCH_S = 2.0
 """Seconds between two polls of the files, with ``--watch``."""
@@ -99,7 +100,7 @@ class Supervisor:
             try:
                 return await self._forks.renew()
             except NotReady as error:
-                log.error("%s; next attempt in %g s", error, FORKED_S)
+                log.error("no_fork_server", "{error}; next attempt in {delay_s:g} s", error=error, delay_s=FORKED_S)
                 await asyncio.sleep(FORKED_S)
 
     async def _end(self) -> None:
@@ -130,7 +131,7 @@ class Supervisor:
                     await self.runners.apply(await asyncio.to_thread(self._follower.poll, running, twice=not asked))
                 await self._forks.renew()
             except (ConfigError, NotReady) as error:
-                log.error("%s", error)
+                log.error("reload_failed", "{error}", error=error)
             if asked:
                 self._systemd.notify("READY=1")
             await self.follow_code(asked=asked)
@@ -160,7 +161,7 @@ class Supervisor:
             await replace(command, self.snapshot, self._forks.rehearse)
         except (HandoverError, NotReady, OSError, UnicodeError) as error:
             self._refused = stamp
-            log.error("the supervisor continues with the old code: %s", error)
+            log.error("supervisor_not_replaced", "the supervisor continues with the old code: {error}", error=error)
 
     def snapshot(self) -> SupervisorState | None:
         """Return all that the code in place of this one needs; None while something is under way."""
@@ -182,13 +183,15 @@ class Supervisor:
         self.runners.resume(self._state.runners)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
         taken_ms = (time.monotonic() - at) * 1000
-        log.info("the installed code has taken over in %.0f ms: %s", taken_ms, self.runners.status)
+        template = "the installed code has taken over in {took_ms:.0f} ms: {status}"
+        log.info("supervisor_replaced", template, took_ms=taken_ms, status=self.runners.status)
 
     # Processes
 
     def _runner(self, file: RobotFile) -> Runner:
-        verbose, most_bytes = self._state.verbose, self._state.host.file_bytes
-        return Runner(file, self._forks, verbose=verbose, changed=self._changed, most_bytes=most_bytes)
+        state = self._state
+        request = Fork("", "", state.verbose, state.log_format, state.log_level)
+        return Runner(file, self._forks, request, changed=self._changed, most_bytes=state.host.file_bytes)
 
     def _changed(self) -> None:
         self._reports.changed()

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import random
 import time
 from collections.abc import Callable, Coroutine, Mapping
@@ -27,12 +26,13 @@ from zbridge.control.context import Conditions
 from zbridge.errors import ZbridgeError
 from zbridge.host.addresses import hold_addresses
 from zbridge.host.settings import HostSettings
+from zbridge.log import Log, current_robot
 from zbridge.metrics import Metrics
 from zbridge.protocol.session_table import Backoff
 from zbridge.tasks import together
 from zbridge.transport.tcp import SHARED_READ_BYTES
 
-log = logging.getLogger("zbridge.host.together")
+log = Log("zbridge.host.together")
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 60.0
 """The pause before a gateway that failed begins anew doubles from the first to the longest."""
@@ -72,7 +72,7 @@ class Together:
             try:
                 await self._serve(self._bus)
             except SessionUseless as error:
-                log.error("%s", error)
+                log.error("shared_session_useless", "{error}", error=error)
             finally:
                 self.left = await self._bus.close()
 
@@ -119,6 +119,7 @@ class Together:
 
     async def _keep_running(self, name: str, plan: GatewayPlan, after_s: float) -> None:
         """Run a gateway, and again after it failed, until cancelled."""
+        current_robot.set(plan.config.robot.name)
         await asyncio.sleep(after_s)
         backoff, metrics = Backoff(FIRST_PAUSE_S, LONGEST_PAUSE_S), robot_metrics(plan, self.metrics)
         while True:
@@ -127,14 +128,14 @@ class Together:
                 await self._run(plan, metrics)
                 return
             except ZbridgeError as error:
-                log.error("%s: %s", name, error)
+                log.error("gateway_failed", "{name}: {error}", name=name, error=error)
             except Exception:
-                log.exception("%s: the gateway failed", name)
+                log.exception("gateway_fault", "{name}: the gateway failed", name=name)
             self._failed.value += 1
             if time.monotonic() - begun >= HEALTHY_S:
                 backoff.reset()
             pause_s = backoff.delay_s()
-            log.warning("%s: restarts in %.1f s", name, pause_s)
+            log.warning("gateway_restarts", "{name}: restarts in {delay_s:.1f} s", name=name, delay_s=pause_s)
             await asyncio.sleep(pause_s)
 
     async def _run(self, plan: GatewayPlan, metrics: Metrics) -> None:

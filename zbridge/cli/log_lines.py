@@ -73,7 +73,7 @@ def plain(value: object) -> str | float:
     if isinstance(value, bool):
         return value
     if isinstance(value, int):
-        return int(value) if value in _INTEGERS else hex(value)
+        return int(value) if value in _INTEGERS else shown(hex(value))
     if isinstance(value, float) and math.isfinite(value):
         return float(value)
     if isinstance(value, bytes | bytearray | memoryview):
@@ -116,12 +116,13 @@ def _fitted(line: dict[str, Any]) -> dict[str, Any]:
     line["message"] = cut(line["message"], MESSAGE_BYTES)
     room = LINE_BYTES - len(_encode(line)) - len(',"fields":{}\n')
     kept: dict[str, Any] = {}
-    for key, value in fields.items():
-        left = room - len(_encode(key)) - len(":,")
+    for number, (key, value) in enumerate(fields.items()):
+        left = room // (len(fields) - number) - len(_encode(key)) - len(":,")  # a fair share
         if isinstance(value, str) and left >= _LEAST:
             value = cut(value, left)
-        if (left := left - len(_encode(value))) >= 0:
-            kept[key], room = value, left
+        if (size := len(_encode(value))) <= left:
+            kept[key] = value
+            room -= len(_encode(key)) + len(":,") + size
     line |= {"fields": kept} if kept else {}
     room = LINE_BYTES - len(_encode(line)) - len(',"traceback":\n')
     return line | ({"traceback": cut(traceback, room, end=True)} if traceback and room >= _LEAST else {})

@@ -130,6 +130,10 @@ class Fleet:
         lease.close()
         assert lease.ask("release", lease.held.question("release")).get("ok")
 
+    def token(self, robot: str = "r1") -> bytes:
+        """The secret of a robot's lease."""
+        return self._leases[robot].held.token
+
     def lost(self, robot: str = "r1") -> bool:
         """Whether the lease of a robot was refused its renewal."""
         return self._leases[robot].lost

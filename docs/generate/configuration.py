@@ -116,7 +116,10 @@ def sections() -> dict[str, str]:
     return {
         "robot file": robot_file(),
         "options": "\n".join(options(find_protocol(name)) for name in protocol_names()),
-        "host file": settings("[host]", HostSettings, host) + "\n" + settings("[log]", LogSettings, host),
+        "host file": "\n".join(
+            settings(name, struct, host)
+            for name, struct in (("[host]", HostSettings), ("[metrics]", MetricsSettings), ("[log]", LogSettings))
+        ),
         "router file": settings("router.toml", RouterSettings, router).replace("`[router.", "`["),
         "ros2 file": settings("ros2.toml", Ros2Settings, {}).replace("`[ros2.", "`["),
     }

@@ -44,9 +44,17 @@ class RobotSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class MetricsSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """``[metrics]``: host:port at which Prometheus reads the counters."""
+    """``[metrics]``: host:port at which Prometheus reads the metrics."""
 
     listen: str
+
+    @property
+    def address(self) -> Address:
+        """The address; raise ConfigError if it is none."""
+        try:
+            return Address.parse(f"tcp://{self.listen}")
+        except LinkError as error:
+            raise ConfigError(f"metrics.listen = {self.listen!r}: expected host:port") from error
 
 
 class LogSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -161,7 +169,7 @@ def plan(raw: dict[str, Any], environment: Mapping[str, str] = os.environ) -> Ga
     for number, at in enumerate(ports):
         if at[1] and ports.count(at) > 1:
             raise ConfigError(f"hq[{number}].listen = {config.hq[number].listen!r}: expected an address of its own")
-    metrics = _metrics_address(config.metrics.listen) if config.metrics else None
+    metrics = config.metrics.address if config.metrics is not None else None
     camera = plan_camera(config.camera) if config.camera is not None else None
     if camera is not None and device is None:
         raise ConfigError("camera: expected only with a table device")
@@ -207,13 +215,6 @@ def _listener_tls(key: str, settings: HqSettings, address: Address) -> SSLContex
         raise ConfigError(f"{key}.listen = {settings.listen!r}: expected tls://host:port, because there is a table tls")
     with prefixed(f"{key}.tls: ", LinkError):
         return server_context(tls.certificate, tls.key, tls.ca)
-
-
-def _metrics_address(text: str) -> Address:
-    try:
-        return Address.parse(f"tcp://{text}")
-    except LinkError as error:
-        raise ConfigError(f"metrics.listen = {text!r}: expected host:port") from error
 
 
 def _substituted(value: Any, environment: Mapping[str, str], key: str) -> Any:

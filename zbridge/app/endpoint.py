@@ -68,6 +68,7 @@ async def serve_metrics(
         return
     endpoint = MetricsServer(_of_process(metrics) if isinstance(metrics, Metrics) else metrics, missing)
     for listening in sockets:
+        listening.setblocking(False)
         endpoint.listen(listening)
     try:
         yield sockets

@@ -35,14 +35,18 @@ Disks = tuple[tuple[str, Path], ...]
 
 
 class ProcessUsage:
-    """Reads what this process uses; where the platform does not say, a number is 0 or None. clock: seconds."""
+    """Reads what this process uses; where the platform does not say, a number is 0 or None.
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+    clock: seconds. threads: whether to read what takes time, on a thread; else only the number of descriptors is read.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic, *, threads: bool = True) -> None:
         self.robots = 0
         """How many robots this process serves."""
         self.disks: dict[str, Disks] = {}
         """The disks of each gateway, by its robot."""
         self._clock = clock
+        self._threads = threads
         self._host = socket.gethostname()
         self._at = self._slowly_at = -SLOW_S
         self._started_s: float = 0.0
@@ -83,7 +87,9 @@ class ProcessUsage:
         used_s, since_s = time.process_time(), now - self._at
         cpu = max(0.0, (used_s - self._processor_s) / since_s) if self._last is not None else 0.0
         self._at, self._processor_s = now, used_s
-        if now - self._slowly_at >= SLOW_S and (self._thread is None or not self._thread.is_alive()):
+        if not self._threads:
+            self._slow.read_files()
+        elif now - self._slowly_at >= SLOW_S and (self._thread is None or not self._thread.is_alive()):
             self._slowly_at = now
             paths = frozenset(path for disks in self.disks.values() for _, path in disks)
             self._thread = threading.Thread(target=self._slow.read, args=(paths,), name="zbridge-usage", daemon=True)
@@ -115,10 +121,13 @@ class _Slow:
         with suppress(OSError, ValueError, StopIteration):
             lines = Path("/proc/self/smaps_rollup").read_text().splitlines()
             self.proportional_bytes = 1024 * int(next(line for line in lines if line.startswith("Pss:")).split()[1])
+        self.read_files()
+        self.free = {path: free for path in paths if (free := free_bytes(path)) is not None}
+
+    def read_files(self) -> None:
         with suppress(OSError):
             self.files = len(os.listdir("/proc/self/fd"))
         self.most_files = _most_files()
-        self.free = {path: free for path in paths if (free := free_bytes(path)) is not None}
 
 
 def free_bytes(path: Path) -> int | None:

@@ -37,6 +37,7 @@ from zbridge.host.addresses import hold_addresses
 from zbridge.host.settings import HostFile, require_different_robots, require_one_bus
 from zbridge.host.together import Together
 from zbridge.log import Log
+from zbridge.metrics.exposition import written
 from zbridge.security.member import check_member
 from zbridge.toml import prefixed, read_file
 
@@ -148,7 +149,8 @@ def run_gateway(
 
     async def work() -> None:
         if reporter is not None:
-            reporter.describe = gateway.restarts.deposit
+            reporter.describe, reporter.missing = gateway.restarts.deposit, gateway.missing
+            reporter.metrics = lambda: written(gateway.metrics.read())
             reporter.begin()
         await until_signal(serve(), {signal.SIGUSR2: gateway.restarts.restart})
 
@@ -200,7 +202,11 @@ def run_together(files: Sequence[Path], host: HostFile, *, verbose: bool = False
     require_different_robots(plans)
     require_one_bus(plans)
     gc.freeze()
-    together = Together({plan.config.robot.name: plan for _, plan in plans}, host.host)
+    together = Together(
+        {plan.config.robot.name: plan for _, plan in plans},
+        host.host,
+        listen=host.metrics.address if host.metrics is not None else None,
+    )
     run_loop(until_signal(together.run()))
     _exit(left=together.left)
 

@@ -25,7 +25,8 @@ def supervise(paths: tuple[Path, ...], *, watch: bool, verbose: bool) -> None:
     folders = [path for path in paths if path.is_dir()]
     found = load_host(folders[0]) if len(folders) == 1 else HostFile()  # several files or folders: the defaults
     log_format, log_level = found.log.format or "", found.log.level or ""
-    _run(SupervisorState(tuple(map(str, paths)), watch, verbose, found.host, log_format, log_level))
+    listen = found.metrics.listen if found.metrics is not None else ""
+    _run(SupervisorState(tuple(map(str, paths)), watch, verbose, found.host, log_format, log_level, listen))
 
 
 def resume(descriptor: int) -> None:

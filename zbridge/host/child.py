@@ -30,15 +30,19 @@ from zbridge.host.fd_channel import (
     Deposited,
     FdChannel,
     Heartbeat,
+    MetricsRead,
     Opened,
+    ReadMetrics,
     Shared,
     Started,
     Succeeded,
     WantSuccessor,
     close_all,
+    in_memory,
 )
 from zbridge.host.memory import DEPOSIT_BYTES, PARTIAL_BYTES, SLOTS, MemoryWriter, slot_of
 from zbridge.log import Log
+from zbridge.metrics.exposition import FamilyLines
 from zbridge.protocol.kept import Budget
 from zbridge.robot.connection import Resume
 from zbridge.robot.observer import LastStop, ObservedRobot, Observer
@@ -100,7 +104,9 @@ class Reporter(Observer):
         """The number of the link of each name."""
         self._memory: MemoryWriter
         self.describe: Describe = lambda parcel, budget: None
-        """Set by the gateway's process."""
+        self.metrics: Callable[[], list[FamilyLines]] = list
+        self.missing: Callable[[], tuple[str, ...]] = tuple
+        """These three are set by the gateway's process."""
         self._timer: asyncio.TimerHandle | None = None
         self._deposit_timer: asyncio.TimerHandle | None = None
         self._answer: asyncio.Future[Started] | None = None
@@ -226,7 +232,7 @@ class Reporter(Observer):
             self._reported.frames,
         ):
             self._deposit()
-        if self._channel.send(Heartbeat(last, streams, self._hands_over)):
+        if self._channel.send(Heartbeat(last, streams, self._hands_over, self.missing())):
             self._reported = last
         self._timer = self._loop.call_later(DRIVEN_HEARTBEAT_S if last.driven else HEARTBEAT_S, self._send_heartbeat)
 
@@ -309,3 +315,13 @@ class Reporter(Observer):
         close_all(descriptors)
         if isinstance(message, Started) and self._answer is not None and not self._answer.done():
             self._answer.set_result(message)
+        elif isinstance(message, ReadMetrics):
+            self._show_metrics(message.number)
+
+    def _show_metrics(self, number: int) -> None:
+        """Answer a question for the metrics; what one of them raises, or no memory, is logged and answers nothing."""
+        try:
+            with in_memory("zbridge metrics", _encode(self.metrics())) as descriptor:
+                self._channel.send(MetricsRead(number), [descriptor])
+        except Exception:
+            log.exception("metrics_unreadable", "the metrics cannot be read")

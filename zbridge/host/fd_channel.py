@@ -27,11 +27,13 @@ class Heartbeat(msgspec.Struct, frozen=True, tag="beat"):
     """The event loop of a gateway runs. streams: the boundaries of the streams of its links, by the links' numbers.
 
     Sent once a second, five times while the robot is driven, and at once when ``last`` becomes another one.
+    missing: why the gateway is of no use now.
     """
 
     last: LastStop = LastStop()
     streams: dict[int, Boundary] = {}
     hands_over: bool = False
+    missing: tuple[str, ...] = ()
 
 
 class Opened(msgspec.Struct, frozen=True, tag="opened"):
@@ -79,7 +81,22 @@ class Succeeded(msgspec.Struct, frozen=True, tag="succeeded"):
     """
 
 
-FromGateway = Heartbeat | Opened | Closed | Shared | Deposited | WantSuccessor | Succeeded
+class MetricsRead(msgspec.Struct, frozen=True, tag="metrics"):
+    """The metrics of a gateway, which :class:`ReadMetrics` asked for; memory with them comes along.
+
+    The memory has MessagePack, a list of :class:`~zbridge.metrics.exposition.FamilyLines`.
+    """
+
+    number: int
+
+
+FromGateway = Heartbeat | Opened | Closed | Shared | Deposited | WantSuccessor | Succeeded | MetricsRead
+
+
+class ReadMetrics(msgspec.Struct, frozen=True, tag="read metrics"):
+    """To a gateway: somebody wants to see your metrics. number: of the question, for the answer."""
+
+    number: int
 
 
 class Started(msgspec.Struct, frozen=True, tag="started"):
@@ -119,7 +136,7 @@ class Ready(msgspec.Struct, frozen=True, tag="ready"):
     threads: int = 1
 
 
-Message = FromGateway | Started | Fork | Forked | Rehearse | Ready
+Message = FromGateway | ReadMetrics | Started | Fork | Forked | Rehearse | Ready
 _encode = msgspec.msgpack.Encoder().encode
 _decode = msgspec.msgpack.Decoder(Message).decode
 

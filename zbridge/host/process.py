@@ -10,6 +10,8 @@ import socket
 import time
 from collections.abc import Callable
 
+import msgspec
+
 from zbridge.host.deposit import Deposit
 from zbridge.host.fd_channel import (
     Closed,
@@ -17,7 +19,9 @@ from zbridge.host.fd_channel import (
     FdChannel,
     FromGateway,
     Heartbeat,
+    MetricsRead,
     Opened,
+    ReadMetrics,
     Shared,
     Started,
     Succeeded,
@@ -28,6 +32,7 @@ from zbridge.host.files import RobotFile
 from zbridge.host.replacement import ProcessState
 from zbridge.host.watchdog import Watchdog
 from zbridge.log import Log
+from zbridge.metrics.exposition import FamilyLines
 from zbridge.robot.observer import LastStop
 
 log = Log("zbridge.host")
@@ -38,6 +43,9 @@ _MESSAGES = 64
 """Most messages that are taken from one process before others are served."""
 _DRAINED = 64
 """The same, times :data:`_MESSAGES`, of a process that has ended: more than its socket holds."""
+METRICS_BYTES = 2 * 2**20
+"""Most bytes of the metrics of one process."""
+_decode_metrics = msgspec.msgpack.Decoder(list[FamilyLines]).decode
 
 
 class GatewayProcess:
@@ -61,6 +69,8 @@ class GatewayProcess:
         self.file = file
         self.deposit = Deposit()
         self.hands_over = False
+        self.missing: tuple[str, ...] = ("starting",)
+        """Why the gateway is of no use now, as it reported last."""
         self.succeeded = False
         """Whether a successor has the robot."""
         self.asked_to_end = False
@@ -73,6 +83,9 @@ class GatewayProcess:
         self._began = time.monotonic()
         self._wants_successor = wants_successor
         self._changed = changed
+        self._question = 0
+        self._metrics: asyncio.Future[list[FamilyLines]] | None = None
+        """The answer to the last question for the metrics."""
         self._loop = asyncio.get_running_loop()
         self._loop.add_reader(channel.fileno(), self.receive)
 
@@ -157,6 +170,7 @@ class GatewayProcess:
                 pass
             case Heartbeat():
                 state, self.deposit.last, self.hands_over = self.last.state, message.last, message.hands_over
+                self.missing = message.missing
                 self.watchdog.heartbeat(time.monotonic(), driven=message.last.driven)
                 self.deposit.duplicates.set_boundaries(message.streams)
                 if message.last.state != state or self.watchdog.heartbeats == 1:
@@ -170,6 +184,8 @@ class GatewayProcess:
                 self.deposit.note(message)
             case Shared() if descriptors and self.deposit.memory is None:
                 self.deposit.share(descriptors.pop(0))
+            case MetricsRead() if descriptors:
+                self._take_metrics(message.number, descriptors[0])
             case WantSuccessor() if descriptors:
                 self._wants_successor(self, socket.socket(fileno=descriptors.pop(0)))
             case WantSuccessor():
@@ -178,6 +194,22 @@ class GatewayProcess:
                 self.succeeded = True
                 self._left.set()
         close_all(descriptors)
+
+    def ask_metrics(self) -> asyncio.Future[list[FamilyLines]]:
+        """Ask the process for its metrics; the answer may never come. The question before is answered no more."""
+        self._question += 1
+        self._metrics = self._loop.create_future()
+        self.channel.send(ReadMetrics(self._question))
+        return self._metrics
+
+    def _take_metrics(self, number: int, descriptor: int) -> None:
+        asked = self._metrics
+        if asked is None or asked.done() or number != self._question:
+            return
+        try:
+            asked.set_result(_decode_metrics(os.pread(descriptor, METRICS_BYTES, 0)))
+        except (OSError, msgspec.MsgspecError, UnicodeError, RecursionError) as error:
+            log.error("metrics_invalid", "process {pid} sent invalid metrics: {error}", pid=self.pid, error=error)
 
     @property
     def last(self) -> LastStop:
@@ -197,7 +229,7 @@ class GatewayProcess:
         if deposit.memory is not None:
             reports.append((Shared(), (deposit.memory.descriptor,)))
         reports += [(Opened(each.link, each.name, each.drives), each.descriptors) for each in links]
-        heartbeat = Heartbeat(deposit.last, {each.link: each.boundary for each in links}, self.hands_over)
+        heartbeat = Heartbeat(deposit.last, {each.link: each.boundary for each in links}, self.hands_over, self.missing)
         reports += [(deposit.deposited or Deposited(), ()), (heartbeat, ())]
         return ProcessState(self.pid, self.channel.fileno(), self._began, self.watchdog, tuple(reports))
 

@@ -75,7 +75,8 @@ class ServerState(msgspec.Struct, frozen=True):
 class SupervisorState(msgspec.Struct, frozen=True, tag_field="version", tag=VERSION):
     """What a supervisor runs; in place of other code also what that code knew.
 
-    log_format, log_level: as in :class:`~zbridge.host.fd_channel.Fork`. at: the time of the replacement, None: this
+    log_format, log_level: as in :class:`~zbridge.host.fd_channel.Fork`. listen: host:port of the metrics; empty: they
+    are not served. sockets: descriptors that listen there. at: the time of the replacement, None: this
     supervisor was just started. is_ready: whether systemd knows that every gateway has begun.
     """
 
@@ -85,6 +86,8 @@ class SupervisorState(msgspec.Struct, frozen=True, tag_field="version", tag=VERS
     host: HostSettings = HostSettings()
     log_format: str = ""
     log_level: str = ""
+    listen: str = ""
+    sockets: tuple[int, ...] = ()
     at: float | None = None
     is_ready: bool = False
     runners: tuple[RunnerState, ...] = ()
@@ -97,7 +100,7 @@ class SupervisorState(msgspec.Struct, frozen=True, tag_field="version", tag=VERS
         processes = [each.process for each in self.runners if each.process is not None]
         servers = (self.server,) if self.server is not None else ()
         reported = (number for each in processes for _, numbers in each.reports for number in numbers)
-        return (*(each.channel for each in (*servers, *processes)), *reported)
+        return (*(each.channel for each in (*servers, *processes)), *reported, *self.sockets)
 
 
 encode = msgspec.msgpack.Encoder().encode

@@ -11,10 +11,10 @@ from typing import Annotated
 
 import msgspec
 
-from zbridge.app.config import GatewayPlan, LogSettings
+from zbridge.app.config import GatewayPlan, LogSettings, MetricsSettings
 from zbridge.errors import ConfigError
 from zbridge.host.addresses import Addresses, resolve
-from zbridge.toml import FILE_BYTES, read_struct
+from zbridge.toml import FILE_BYTES, prefixed, read_struct
 
 HOST_FILE = "host.toml"
 """The file of a directory that is no robot's."""
@@ -35,16 +35,21 @@ class HostSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class HostFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """``host.toml``. log: of the supervisor, and of gateways whose files say nothing of it."""
+    """``host.toml``. metrics: of all gateways. log: of the supervisor, and of gateways whose files have no table."""
 
     host: HostSettings = HostSettings()
+    metrics: MetricsSettings | None = None
     log: LogSettings = LogSettings()
 
 
 def load_host(directory: Path) -> HostFile:
     """Read ``host.toml`` of a directory; the defaults where there is none. Raises ConfigError, which names the file."""
     path = directory / HOST_FILE
-    return read_struct(path, HostFile) if path.exists() else HostFile()
+    found = read_struct(path, HostFile) if path.exists() else HostFile()
+    if found.metrics is not None:
+        with prefixed(f"{path}: "):
+            found.metrics.address  # noqa: B018 - raises
+    return found
 
 
 def robot_files(directory: Path) -> list[Path]:

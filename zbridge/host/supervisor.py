@@ -12,16 +12,19 @@ from __future__ import annotations
 import asyncio
 import ctypes
 import signal
+import socket
 import time
 from pathlib import Path
 
 import msgspec
 
+from zbridge.app.config import MetricsSettings
 from zbridge.app.handover.processes import Systemd
 from zbridge.errors import ConfigError, HandoverError, NotReady
 from zbridge.host.fd_channel import Fork
 from zbridge.host.files import Follower, RobotFile, compare, read_all
 from zbridge.host.fork_client import ForkClient, module_command
+from zbridge.host.metrics import HostMetrics
 from zbridge.host.replacement import SIGNALS, SupervisorState, quiet_threads, replace
 from zbridge.host.runner import Runner
 from zbridge.host.runners import Reports, Runners
@@ -61,6 +64,8 @@ class Supervisor:
         self._running = Tasks()
         self._timer: asyncio.TimerHandle | None = None
         self._reload = asyncio.Event()
+        self._sockets: list[socket.socket] = []
+        """Those at which the metrics are served."""
 
     def __repr__(self) -> str:
         return f"<Supervisor of {len(self.runners.by_path)} robots>"
@@ -85,7 +90,7 @@ class Supervisor:
             else:
                 await self._start_forks()
             self._code = self._forks.stamp
-            for task in (self.follow(), self._reports.live()):
+            for task in (self.follow(), self._reports.live(), self._serve_metrics()):
                 self._running.start(task)
             self._check_watchdogs()
             await self.runners.apply(compare({}, files), first=True)
@@ -94,6 +99,14 @@ class Supervisor:
             await asyncio.shield(self._end())
             for number in (signal.SIGCHLD, signal.SIGHUP, signal.SIGUSR2):
                 loop.remove_signal_handler(number)
+
+    async def _serve_metrics(self) -> None:
+        if not self._state.listen:
+            return
+        adopted = [socket.socket(fileno=number) for number in self._state.sockets]
+        metrics = HostMetrics(self.runners)
+        async with metrics.serve(MetricsSettings(self._state.listen).address, adopted) as self._sockets:
+            await asyncio.Event().wait()
 
     async def _start_forks(self) -> None:
         while True:
@@ -171,6 +184,7 @@ class Supervisor:
             self._state,
             at=time.monotonic(),
             is_ready=self._reports.is_ready,
+            sockets=tuple(each.fileno() for each in self._sockets),
             runners=tuple(runner.snapshot for runner in self.runners.by_path.values()),
             server=self._forks.state,
             faults={str(path): fault for path, fault in self.runners.faults.items() if str(path).isprintable()},

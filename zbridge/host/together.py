@@ -20,6 +20,8 @@ from zbridge.app.config import GatewayPlan
 from zbridge.app.endpoint import serve_metrics
 from zbridge.app.gateway import Gateway, Neighbourhood, robot_metrics
 from zbridge.app.joining import SessionUseless, can_connect, join_bus, watch_certificate, watch_session
+from zbridge.app.process_usage import USAGE
+from zbridge.app.readings import LoopLateness
 from zbridge.bus import Bus
 from zbridge.bus.tls.files import own_certificate
 from zbridge.control.context import Conditions
@@ -28,6 +30,7 @@ from zbridge.host.addresses import hold_addresses
 from zbridge.host.settings import HostSettings
 from zbridge.log import Log, current_robot
 from zbridge.metrics import Metrics
+from zbridge.protocol.address import Address
 from zbridge.protocol.session_table import Backoff
 from zbridge.tasks import together
 from zbridge.transport.tcp import SHARED_READ_BYTES
@@ -46,21 +49,30 @@ class Together:
     """The gateways of one process, by name: the robot's, or its file's.
 
     plans: all with the same ``[bus]`` and different robots (:mod:`zbridge.host.settings` checks both). The counters of
-    a gateway have the label ``robot``; every ``[metrics]`` address shows those of all. hold: holds the robot's
-    addresses while its gateway runs.
+    a gateway have the labels ``realm`` and ``robot``; every ``[metrics]`` address shows those of all. hold: holds the
+    robot's addresses while its gateway runs. listen: where the metrics are served besides.
     """
 
-    def __init__(self, plans: Mapping[str, GatewayPlan], host: HostSettings, hold: Hold = hold_addresses) -> None:
+    def __init__(
+        self,
+        plans: Mapping[str, GatewayPlan],
+        host: HostSettings,
+        hold: Hold = hold_addresses,
+        listen: Address | None = None,
+    ) -> None:
         self.left = True
         """Whether the bus was closed in order; if not, one of its threads may hang."""
         self.metrics = Metrics()
         self._plans = plans
         self._host = host
         self._hold = hold
+        self._listen = listen
         self._bus: Bus | None = None
         self._failed = self.metrics.count("gateway_failures")
         self._neighbourhood = Neighbourhood(host.share, bytearray(SHARED_READ_BYTES))
         self._tasks: dict[str, asyncio.Task[None]] = {}
+        self._gateways: dict[str, Gateway] = {}
+        """Those that run."""
 
     def __len__(self) -> int:
         return len(self._tasks)
@@ -83,8 +95,10 @@ class Together:
         certificate = own_certificate(settings.tls)
         watches: list[Coroutine[Any, Any, None]] = []
         async with contextlib.AsyncExitStack() as stack:
-            for address in {plan.metrics for plan in self._plans.values() if plan.metrics is not None}:
-                await stack.enter_async_context(serve_metrics(address, self.metrics))
+            stack.callback(self.metrics.add_source(USAGE.readings))
+            stack.callback(LoopLateness(self.metrics).begin())
+            for address in filter(None, {self._listen, *(plan.metrics for plan in self._plans.values())}):
+                await stack.enter_async_context(serve_metrics(address, self.metrics, self.missing))
             stack.push_async_callback(self.close)
             for number, (name, plan) in enumerate(self._plans.items()):
                 self.start(name, plan, (number + random.random()) * self._host.stagger_s)
@@ -95,6 +109,12 @@ class Together:
             if watches:
                 await together(*watches)
             await asyncio.Event().wait()
+
+    def missing(self) -> tuple[str, ...]:
+        """Return what the gateways lack to be of use."""
+        running = {name: gateway.missing() for name, gateway in self._gateways.items()}
+        reasons = {name: running.get(name, ("no gateway",)) for name in self._tasks}
+        return tuple(f"{name}: {reason}" for name, each in reasons.items() for reason in each)
 
     def start(self, name: str, plan: GatewayPlan, after_s: float = 0.0) -> None:
         """Start a gateway in ``after_s`` seconds; raise ValueError if the name is taken."""
@@ -125,7 +145,7 @@ class Together:
         while True:
             begun = time.monotonic()
             try:
-                await self._run(plan, metrics)
+                await self._run(name, plan, metrics)
                 return
             except ZbridgeError as error:
                 log.error("gateway_failed", "{name}: {error}", name=name, error=error)
@@ -138,11 +158,13 @@ class Together:
             log.warning("gateway_restarts", "{name}: restarts in {delay_s:.1f} s", name=name, delay_s=pause_s)
             await asyncio.sleep(pause_s)
 
-    async def _run(self, plan: GatewayPlan, metrics: Metrics) -> None:
+    async def _run(self, name: str, plan: GatewayPlan, metrics: Metrics) -> None:
         assert self._bus is not None, "run() opens the bus"
         bus = self._bus.share(metrics)
         try:
             async with self._hold(plan):
-                await Gateway(plan, metrics).run_on(bus, self._neighbourhood)
+                self._gateways[name] = gateway = Gateway(plan, metrics)
+                await gateway.run_on(bus, self._neighbourhood)
         finally:
+            self._gateways.pop(name, None)
             await bus.close()

@@ -153,7 +153,6 @@ GROUPS: dict[str, tuple[Family, ...]] = {
     "Supervisor": (
         *_gauges(
             ("gateway_up", "1 if the robot's gateway answered this scrape, else 0."),
-            ("gateway_state", "1 for the robot's state as the supervisor knows it; down: no process.", "state"),
             ("faulty_files", "Robot files that cannot be used."),
         ),
         *_counters(("gateway_restarts", "Processes started in place of one that died.")),

@@ -96,3 +96,9 @@ def test_the_documented_file_has_the_defaults(tmp_path: Path) -> None:
     assert load_host(tmp_path) == HostFile()
     for field in (*HostSettings.__struct_fields__, *(f"# {name}" for name in LogSettings.__struct_fields__)):
         assert f"\n{field} = " in documented.read_text()
+
+
+def test_an_address_of_the_metrics_that_is_none_is_an_error_that_names_file_and_key(tmp_path: Path) -> None:
+    (tmp_path / "host.toml").write_text('[metrics]\nlisten = "9100"\n')
+    with pytest.raises(ConfigError, match=r"host.toml: metrics.listen = '9100': expected host:port"):
+        load_host(tmp_path)

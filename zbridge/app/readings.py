@@ -8,11 +8,11 @@ from __future__ import annotations
 import asyncio
 from collections import Counter
 from collections.abc import Callable, Iterator
-from typing import get_args
+from typing import Any, get_args
 
 from zbridge.fleet.messages import RobotState
-from zbridge.metrics import Histogram, Metrics, Reading
-from zbridge.protocol.session import Role
+from zbridge.metrics import OTHER, Histogram, Metrics, Reading
+from zbridge.protocol.session import Role, Session
 from zbridge.protocol.session_table import SessionTable
 from zbridge.robot.device import RobotDevice
 
@@ -23,7 +23,7 @@ _STATES: tuple[str, ...] = get_args(RobotState)
 
 def session_readings(sessions: SessionTable) -> Iterator[Reading]:
     """Read the sessions that there are, what all have carried, and what waits for their peers."""
-    present = Counter((each.role, each.state.value, each.version or "") for each in sessions)
+    present = Counter((each.role, each.state.value, _version(each)) for each in sessions)
     for (role, state, version), number in present.items():
         yield "sessions", {"role": role.value, "state": state, "version": version}, number
     for role, queue in ((Role.HQ, "robot_out"), (Role.ROBOT, "hq_out")):
@@ -33,6 +33,11 @@ def session_readings(sessions: SessionTable) -> Iterator[Reading]:
             yield "link_bytes", labels, getattr(carried, f"bytes_{direction}")
             yield "link_frames", labels, getattr(carried, f"frames_{direction}")
         yield "queue_length", {"queue": queue}, sum(len(each.outbox) for each in sessions if each.role is role)
+
+
+def _version(session: Session[Any]) -> str:
+    version = session.version or ""
+    return version if not version or version in session.known_versions else OTHER
 
 
 def robot_readings(device: RobotDevice | None, protocol: str) -> Iterator[Reading]:

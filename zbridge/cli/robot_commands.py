@@ -48,7 +48,7 @@ def foxglove(
     turn_full_radps: FullTurns = [],
     who: DriverName = "",
     viewers: Annotated[int, typer.Option(help="maximum number of viewers", min=1, max=1000)] = 32,
-    metrics: Annotated[str, typer.Option(help="host:port at which Prometheus reads the counters")] = "",
+    metrics: Annotated[str, typer.Option(help="host:port at which Prometheus reads the metrics")] = "",
     connect: Connect = [],
     tls: TlsFolder = None,
     realm: Realm = "fleet",
@@ -241,6 +241,7 @@ def ros2(
     ros: Annotated[
         list[str], typer.Option(help="ROS's router; tcp/localhost:7447 by default", show_default=False)
     ] = [],
+    metrics: Annotated[str, typer.Option(help="host:port at which Prometheus reads the metrics")] = "",
     connect: Connect = [],
     tls: TlsFolder = None,
     realm: Annotated[str, typer.Option(help="first chunk of all keys; fleet by default", show_default=False)] = "",
@@ -256,6 +257,7 @@ def ros2(
         "drive": drive or None,
         "distro": distro or None,
         "ros": tuple(ros) or None,
+        "metrics": metrics or None,
         "realm": realm or None,
     }
     given = {name: value for name, value in options.items() if value is not None}

@@ -8,6 +8,7 @@ clock, loop or socket; :mod:`zbridge.app.endpoint` serves them.
 from zbridge.metrics.families import FAMILIES as FAMILIES
 from zbridge.metrics.families import Family as Family
 from zbridge.metrics.families import MetricKind as MetricKind
+from zbridge.metrics.registry import OTHER as OTHER
 from zbridge.metrics.registry import Metrics as Metrics
 from zbridge.metrics.registry import Reading as Reading
 from zbridge.metrics.values import Count as Count

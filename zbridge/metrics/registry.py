@@ -69,7 +69,8 @@ class Metrics:
     def add_source(self, source: Source) -> Callable[[], object]:
         """Read ``source`` whenever the metrics are read; return what ends that.
 
-        A source yields gauges, and counters that something else keeps. What it raises is the caller's error.
+        A source yields gauges, and counters that something else keeps; where several yield a series, their values are
+        added. What a source raises is the caller's error.
         """
         self._sources[source] = self._own
         return lambda: self._sources.pop(source, None)
@@ -87,18 +88,19 @@ class Metrics:
 
     def read(self) -> list[tuple[Family, list[tuple[Labels, Value]]]]:
         """Return every metric with its values, in the order of their full names."""
-        found: dict[str, list[tuple[Labels, Value]]] = {}
+        found: dict[str, dict[Labels, Value]] = {}
         for name, labels, value in self:
-            found.setdefault(name, []).append((labels, value))
+            found.setdefault(name, {})[labels] = value
         own = set(self._own.items())
         for (name, labels), histogram in self._histograms.items():
             if own.issubset(labels):
-                found.setdefault(name, []).append((labels, (tuple(histogram.counts), histogram.sum_s)))
+                found.setdefault(name, {})[labels] = (tuple(histogram.counts), histogram.sum_s)
         for source, theirs in list(self._sources.items()):
             if own <= set(theirs.items()):
                 for name, given, number in source():
-                    found.setdefault(name, []).append((_sorted({**theirs, **given}), number))
-        families = ((FAMILIES.get(name) or self._families[name], values) for name, values in found.items())
+                    values, labels = found.setdefault(name, {}), _sorted({**theirs, **given})
+                    values[labels] = number + _number(values.get(labels, 0))
+        families = ((FAMILIES.get(name) or self._families[name], list(each.items())) for name, each in found.items())
         return sorted(families, key=lambda item: item[0].full_name)
 
     def exposition(self) -> str:
@@ -126,3 +128,7 @@ class Metrics:
 
 def _sorted(labels: dict[str, str]) -> Labels:
     return tuple(sorted(labels.items()))
+
+
+def _number(value: Value) -> float:
+    return value if isinstance(value, int | float) else 0

@@ -48,12 +48,10 @@ LINGER_S = 0.5
 DOUBTS = 2
 """Doubts about a connection that together forbid motion; one alone may be an accident."""
 
-
 PARTIAL = "partial"
 """The name of the incomplete frame in a state."""
 SKIPPED = "the rest of a frame whose beginning was lost with a gateway"
 """What a session counts among what it left out."""
-
 
 _ESTABLISHED, _CLOSING, _CLOSED = State.ESTABLISHED, State.CLOSING, State.CLOSED
 """Every message is compared with these; looking them up in the class is slow in Python 3.11."""
@@ -79,6 +77,8 @@ class Session(Kept, ABC, Generic[M]):
     }
     role: Role
     frame_end: FrameEnd
+    known_versions: frozenset[str] = frozenset()
+    """The versions that may be agreed; metrics show all others, which a peer may have made up, as one."""
     handled: frozenset[type] = frozenset()
     """Message classes that go to ``accept`` after the handshake too."""
     silent_s: float | None = None

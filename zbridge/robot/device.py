@@ -37,6 +37,7 @@ from zbridge.robot.publishers import RobotPublishers
 from zbridge.robot.queries import PendingQueries, Queries
 from zbridge.robot.telemetry import Telemetry
 from zbridge.transport import ConversationHooks, Parcel, Transferable
+from zbridge.transport.reading import ReadTimes
 from zbridge.wire.frames import Partial
 
 HEARD_S = 3.0
@@ -122,7 +123,7 @@ class RobotDevice(Transferable):
             before=self.enforcer.keep_time,
             clock=context.clock,
             share=settings.share,
-            times=context.metrics.histogram("socket_to_bus_seconds"),
+            times=ReadTimes(context.metrics.histogram("socket_to_bus_seconds")),
             malformed=context.metrics.count("malformed_frames"),
             foreign=context.metrics.count("foreign_datagrams"),
             surplus=context.metrics.count("surplus_datagrams"),

@@ -25,11 +25,11 @@ import msgspec
 
 from zbridge.errors import FAULT, Refused, describe
 from zbridge.log import Log
-from zbridge.metrics import Count, Histogram
+from zbridge.metrics import Count
 from zbridge.protocol.kept import Budget, Exported
 from zbridge.protocol.session import Datagram, Session, State
 from zbridge.transport.link import STALLED_S, Link, Receiver
-from zbridge.transport.reading import FairShare, ReadControl
+from zbridge.transport.reading import UNTIMED, FairShare, ReadControl, ReadTimes
 from zbridge.transport.transferable import Parcel
 
 log = Log("zbridge.link")
@@ -40,8 +40,6 @@ CATCH_UP_S = 0.05
 """Seconds for which such a process reads before it runs the session's timers."""
 CHECK_S = 0.05
 """Seconds between two checks of a stalled link."""
-TIMED_S = 0.05
-"""Least seconds between two reads of a link that are timed: timing each would cost as much as handling it."""
 _ESTABLISHED, _CLOSED = State.ESTABLISHED, State.CLOSED
 
 _C = TypeVar("_C", bound="Conversation")
@@ -71,8 +69,8 @@ class ConversationHooks(msgspec.Struct, frozen=True, kw_only=True):
     """Seconds on the loop's time line; by default the loop's own clock, which may be a millisecond behind."""
     share: FairShare | None = None
     """Of a processor; a peer that sends more than can be processed within it is not read meanwhile."""
-    times: Histogram | None = None
-    """Of a read every TIMED_S, from the read until its messages are handed on."""
+    times: ReadTimes = UNTIMED
+    """From a read until its messages are handed on."""
     malformed: Count = msgspec.field(default_factory=Count)
     foreign: Count = msgspec.field(default_factory=Count)
     rivals: Count = msgspec.field(default_factory=Count)
@@ -109,8 +107,7 @@ class Conversation(Receiver):
         self._hooks = hooks
         self._clock = clock = hooks.clock or loop.time
         self._before, self._read = hooks.before, hooks.read
-        self._timed_at = -math.inf if hooks.times is not None else math.inf
-        """When the next read is timed."""
+        self._times = hooks.times
         self._observed: Link | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at: float | None = None
@@ -148,8 +145,8 @@ class Conversation(Receiver):
             if self._read is not None:
                 self._read()
             self._hand_on(messages)
-            if begun >= self._timed_at:
-                self._timed(begun)
+            if begun >= self._times.due:
+                self._times.note(begun, self._clock())
         except Exception as error:
             self._fault(error)
         else:
@@ -190,12 +187,6 @@ class Conversation(Receiver):
                 error=self.session.last_malformed,
             )
         self._malformed_logged = count
-
-    def _timed(self, begun: float) -> None:
-        """Note how long a read has taken so far."""
-        assert self._hooks.times is not None
-        self._hooks.times.observe(self._clock() - begun)
-        self._timed_at = begun + TIMED_S
 
     def _fault(self, error: Exception) -> None:
         """End the session, and log where the code of its protocol is wrong."""

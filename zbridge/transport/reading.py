@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import Callable
 
+from zbridge.metrics import Histogram
 from zbridge.transport.link import Link
 
 BURST_S = 0.02
 """Seconds of work that may be done at once after a quiet time."""
+TIMED_S = 0.05
+"""Least seconds between two reads that are timed."""
 
 
 class FairShare:
@@ -100,3 +104,24 @@ class ReadControl:
         if self.link is not None and self._rests is None and not self.suspended:
             self.link.resume_reading()
             self.resumed()
+
+
+class ReadTimes:
+    """Times reads that are :data:`TIMED_S` apart; to time each would cost too much. due: when the next is timed."""
+
+    def __init__(self, seconds: Histogram | None) -> None:
+        self.due = -math.inf if seconds is not None else math.inf
+        self._seconds = seconds
+
+    def __repr__(self) -> str:
+        return f"<ReadTimes {self._seconds}>"
+
+    def note(self, begun: float, now: float) -> None:
+        """Note that a read is handed on, and when the next one is timed."""
+        if self._seconds is not None:
+            self._seconds.observe(now - begun)
+            self.due = begun + TIMED_S
+
+
+UNTIMED = ReadTimes(None)
+"""Times nothing."""

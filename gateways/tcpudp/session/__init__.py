@@ -18,6 +18,7 @@ from gateways.tcpudp.messages import (
     encode_packet,
     frame_end,
 )
+from gateways.tcpudp.settings import VERSIONS
 from zbridge.protocol import Limits, ProtocolError, Role, Session
 
 HANDSHAKE_S = 5.0
@@ -48,6 +49,7 @@ class PacketSession(Session[Packet]):
     """A session that speaks packets."""
 
     frame_end = staticmethod(frame_end)
+    known_versions = frozenset(VERSIONS)
     sender_id: int
     """The ``id`` byte of what the session sends."""
 

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 from collections.abc import Callable
 
+from zbridge.app.endpoint import serve_metrics
 from zbridge.bus import Bus, BusSettings, open_bus
 from zbridge.bus.tls.files import own_name
 from zbridge.errors import BusError, ConfigError
@@ -33,7 +34,7 @@ async def serve(plan: Ros2Plan, bus: BusSettings, metrics: Metrics, on_ready: Ca
         fleet = await open_bus(bus, metrics, wait_for_peers=True, realm=plan.realm, threads=False)
         stack.push_async_callback(fleet.close)
         try:
-            ros = await open_bus(plan.router, metrics, timestamps=True, threads=False)
+            ros = await open_bus(plan.router, metrics.labelled(bus="ros"), timestamps=True, threads=False)
         except BusError as error:
             where = ", ".join(plan.router.connect)
             raise BusError(f"{error}: no ROS router at {where}: `ros2 run rmw_zenoh_cpp rmw_zenohd`") from error
@@ -41,6 +42,8 @@ async def serve(plan: Ros2Plan, bus: BusSettings, metrics: Metrics, on_ready: Ca
         require_two_routers(fleet, ros, plan)
         view = View(plan, fleet, RosSide(ros, plan.domain, types, metrics), own_name(bus.tls))
         stack.push_async_callback(view.close)
+        if plan.endpoint is not None:
+            await stack.enter_async_context(serve_metrics(plan.endpoint, metrics))
         view.start()
         on_ready(view)
         await asyncio.Event().wait()

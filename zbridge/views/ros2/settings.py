@@ -8,8 +8,9 @@ from typing import Annotated
 import msgspec
 
 from zbridge.bus import BusSettings
-from zbridge.errors import ConfigError
+from zbridge.errors import ConfigError, LinkError
 from zbridge.fleet.topics import is_name
+from zbridge.protocol.address import Address
 from zbridge.ros2.types import DISTROS
 
 ROS_ROUTER = "tcp/localhost:7447"
@@ -57,7 +58,8 @@ class Ros2Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     domain: ROS_DOMAIN_ID. distro: distribution of ROS 2. ros: ROS's routers, never the fleet's; empty: the one on this
     machine. robots: those that are shown, empty for all. drive: let publishers drive. realm: the first chunk of all
-    keys. bus: the fleet's, as in a robot's file. others: of robots that have no table of their own below ``robot``.
+    keys. bus: as in a robot's file. metrics: host:port at which Prometheus
+    reads; empty: none. others: of robots that have no table of their own below ``robot``.
     robot: tables of single robots.
     """
 
@@ -68,6 +70,7 @@ class Ros2Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     drive: bool = False
     realm: str = "fleet"
     bus: BusSettings | None = None
+    metrics: str = ""
     others: RobotBody = RobotBody()
     robot: dict[str, RobotBody] = {}
 
@@ -76,9 +79,10 @@ class Ros2Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Ros2Plan(Ros2Settings, frozen=True):
-    """Settings that are sound. router: how ROS's router is reached."""
+    """Settings that are sound. router: how ROS's router is reached. endpoint: of the metrics."""
 
     router: BusSettings = BusSettings()
+    endpoint: Address | None = None
 
 
 def plan(settings: Ros2Settings) -> Ros2Plan:
@@ -90,9 +94,13 @@ def plan(settings: Ros2Settings) -> Ros2Plan:
     for name in sorted({*settings.robots, *settings.robot}):
         if not is_name(name):
             raise ConfigError(f"robot {name!r}: expected letters, digits, '_', '.' and '-' only")
+    try:
+        metrics = Address.parse(f"tcp://{settings.metrics}") if settings.metrics else None
+    except LinkError as error:
+        raise ConfigError(f"metrics = {settings.metrics!r}: expected host:port") from error
     connect = settings.ros or (ROS_ROUTER,)
     try:
         router = msgspec.convert({"mode": "client", "connect": connect, "multicast": False}, BusSettings)
     except msgspec.ValidationError as error:
         raise ConfigError(f"ros = {list(connect)}: expected Zenoh endpoints like {ROS_ROUTER!r}") from error
-    return Ros2Plan(**msgspec.structs.asdict(settings), router=router)
+    return Ros2Plan(**msgspec.structs.asdict(settings), router=router, endpoint=metrics)

@@ -18,7 +18,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from zbridge.fleet.processes import DiskSpace, ProcessStats
-from zbridge.metrics import Reading
+from zbridge.metrics import Metrics, Reading
 from zbridge.version import __version__
 
 APART_S = 0.5
@@ -167,3 +167,10 @@ def _started_s() -> float:
 
 USAGE = ProcessUsage()
 """This process."""
+
+
+def process_metrics() -> Metrics:
+    """Make the metrics of a process that is no gateway: they show what it uses."""
+    metrics = Metrics()
+    metrics.add_source(USAGE.readings)
+    return metrics

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from zbridge.app import until_signal
+from zbridge.app.process_usage import process_metrics
 from zbridge.bus import BusSettings
 from zbridge.bus.tls.files import own_name, own_role
 from zbridge.cli import run_loop
@@ -18,7 +19,6 @@ from zbridge.client import joined
 from zbridge.client.fleet import Fleet
 from zbridge.control.latch_store import state_folder
 from zbridge.errors import ConfigError, LinkError
-from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.toml import convert, read_toml
 from zbridge.views.console.roster import Roster
@@ -40,7 +40,7 @@ def run_foxglove(bus: BusSettings, realm: str, file: Path | None, given: dict[st
     options = chosen(FoxgloveOptions, given)
     if options.drive and (role := own_role(bus.tls)) in ("viewer", "recorder"):
         raise ConfigError(f"--drive: a {role} may not drive: expected the certificate of an operator")
-    planned, metrics = plan(options), Metrics()
+    planned, metrics = plan(options), process_metrics()
 
     def ready(viewers: ViewerServer) -> None:
         scheme = "wss" if planned.tls is not None else "ws"
@@ -109,4 +109,4 @@ def run_ros2(bus: BusSettings | None, default: BusSettings, file: Path | None, g
         where = ", ".join(planned.router.connect)
         print(f"ROS 2 {planned.distro}, domain {planned.domain}, at {where}", flush=True)  # noqa: T201
 
-    run_loop(until_signal(server.serve(planned, bus or written.bus or default, Metrics(), ready)))
+    run_loop(until_signal(server.serve(planned, bus or written.bus or default, process_metrics(), ready)))

@@ -17,11 +17,11 @@ from starlette.responses import FileResponse
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 
+from zbridge.app.process_usage import process_metrics
 from zbridge.bus import Bus
 from zbridge.client.fleet import Fleet
 from zbridge.control.audit_log import AuditFile
 from zbridge.errors import ConfigError
-from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.tasks import race
 from zbridge.views.console.api import Api
@@ -106,7 +106,7 @@ async def serve(
     context = None
     if settings.certificate is not None and settings.key is not None:
         context = tls_context(settings.certificate, settings.key)
-    callers, metrics, faults = Callers(settings.users, settings.own_role), Metrics(), dict[str, str | None]()
+    callers, metrics, faults = Callers(settings.users, settings.own_role), process_metrics(), dict[str, str | None]()
     origins = settings.origins(*listening.getsockname()[:2])
     with contextlib.ExitStack() as stack:
         journal = Journal()

@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import os
 import signal
 import socket
 from collections.abc import AsyncIterator, Iterator
@@ -20,7 +21,9 @@ from zbridge.host.fd_channel import (
     FdChannel,
     Heartbeat,
     Message,
+    MetricsRead,
     Opened,
+    ReadMetrics,
     Shared,
     Started,
     Succeeded,
@@ -28,6 +31,7 @@ from zbridge.host.fd_channel import (
     close_all,
 )
 from zbridge.host.memory import DEPOSIT_BYTES, SLOTS, MemoryReader
+from zbridge.metrics.exposition import FamilyLines
 from zbridge.protocol.kept import Budget
 from zbridge.robot.observer import Boundary, LastStop, StopFrame
 from zbridge.transport import Parcel
@@ -385,3 +389,36 @@ async def test_the_end_of_the_supervisor_ends_the_process_in_order(scene: Scene)
     async with asyncio.timeout(10):
         await ended.wait()
     asyncio.get_running_loop().remove_signal_handler(signal.SIGTERM)
+
+
+# Its metrics
+
+
+async def test_a_question_for_the_metrics_is_answered_in_memory_and_a_fault_answers_nothing(scene, caplog) -> None:
+    lines = [FamilyLines("zbridge_refused_total", "counter", "Refused.", "zbridge_refused_total 1\n")]
+    scene.reporter.metrics = lambda: lines
+    scene.channel.send(ReadMetrics(7))
+    await asyncio.sleep(0.01)
+    received = scene.channel.receive()
+    assert received is not None
+    message, (descriptor,) = received
+    assert message == MetricsRead(7)
+    assert msgspec.msgpack.decode(os.pread(descriptor, 10_000, 0), type=list[FamilyLines]) == lines
+    close_all([descriptor])
+
+    def fail() -> list[FamilyLines]:
+        raise KeyError("broken")
+
+    scene.reporter.metrics = fail
+    scene.channel.send(ReadMetrics(8))
+    await asyncio.sleep(0.01)
+    assert scene.told() == []
+    assert "the metrics cannot be read" in caplog.text
+
+
+async def test_a_beat_tells_what_is_missing(scene: Scene) -> None:
+    scene.reporter.missing = lambda: ("no bus",)
+    scene.device.now = LastStop(driven=True)
+    scene.reporter.changed()
+    (heartbeat,) = (message for message in await scene.soon() if isinstance(message, Heartbeat))
+    assert heartbeat.missing == ("no bus",)

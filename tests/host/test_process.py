@@ -10,12 +10,26 @@ import socket
 from collections.abc import AsyncIterator
 from pathlib import Path
 
+import msgspec
 import pytest
 
-from zbridge.host.fd_channel import Deposited, FdChannel, Heartbeat, Opened, Shared, Started, Succeeded, WantSuccessor
+from zbridge.host.fd_channel import (
+    Deposited,
+    FdChannel,
+    Heartbeat,
+    MetricsRead,
+    Opened,
+    ReadMetrics,
+    Shared,
+    Started,
+    Succeeded,
+    WantSuccessor,
+    in_memory,
+)
 from zbridge.host.files import RobotFile
 from zbridge.host.memory import MemoryWriter
-from zbridge.host.process import GatewayProcess
+from zbridge.host.process import METRICS_BYTES, GatewayProcess
+from zbridge.metrics.exposition import FamilyLines
 from zbridge.robot.observer import LastStop
 
 FILE = RobotFile(Path("r1.toml"), b"", ("fleet", "r1"))
@@ -193,3 +207,46 @@ async def test_a_process_that_is_closed_leaves_no_descriptor_open(scene: Scene) 
     scene.process.close()
     scene.process.close()
     assert len(os.listdir("/proc/self/fd")) == before - 1, "its end of the channel is closed too"
+
+
+# Its metrics
+
+
+async def test_the_metrics_of_a_process_are_those_of_the_last_question(scene: Scene) -> None:
+    lines = [FamilyLines("zbridge_refused_total", "counter", "Refused.", "zbridge_refused_total 1\n")]
+    first, second = scene.process.ask_metrics(), scene.process.ask_metrics()
+    assert [scene.told.receive() for _ in range(2)] == [(ReadMetrics(1), []), (ReadMetrics(2), [])]
+    answer(scene, 1, b"late")
+    assert not second.done()
+    answer(scene, 2, msgspec.msgpack.encode(lines))
+    assert second.result() == lines
+    answer(scene, 2, msgspec.msgpack.encode([]))
+    assert second.result() == lines
+    assert not first.done()
+
+
+@pytest.mark.parametrize(
+    "content", [b"\xc1", msgspec.msgpack.encode([1]), b"\x91\x94" * 1000, b"\xdc\xff\xff" + bytes(METRICS_BYTES)]
+)
+async def test_invalid_metrics_are_none_and_told(
+    scene: Scene, caplog: pytest.LogCaptureFixture, content: bytes
+) -> None:
+    asked = scene.process.ask_metrics()
+    answer(scene, 1, content)
+    reading, writing = os.pipe()
+    scene.told.send(MetricsRead(1), [reading])  # no file at all
+    scene.told.send(MetricsRead(1))
+    scene.process.receive()
+    for descriptor in (reading, writing):
+        os.close(descriptor)
+    assert not asked.done()
+    assert caplog.text.count("sent invalid metrics") == 2
+
+
+def answer(scene: Scene, number: int, content: bytes) -> None:
+    """Let the process answer a question for its metrics."""
+    before = len(os.listdir("/proc/self/fd"))
+    with in_memory("metrics", content) as descriptor:
+        scene.told.send(MetricsRead(number), [descriptor])
+    scene.process.receive()
+    assert len(os.listdir("/proc/self/fd")) == before

@@ -7,13 +7,14 @@ Theory of operation. Clients are accepted in batches with a pause between them, 
 the event loop's time. A client costs one descriptor and no task, and has :data:`REQUEST_S` to send its request. Where
 more than :data:`CLIENTS` are connected, the oldest client of the address that has most of them is closed: a thousand
 clients that say nothing keep no scrape waiting. What is no request is refused with its first bytes. All who ask for the
-metrics within :data:`FRESH_S` get the same text, which is written once.
+metrics within a moment get the same text, so that reading them takes a twentieth of the event loop's time at most.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import re
 import socket
 from collections import Counter
@@ -37,8 +38,8 @@ BATCH, PAUSE_S = 8, 0.005
 """Clients that are accepted at once, and seconds to the next ones."""
 WAITING = 1024
 """Most clients that wait in the kernel's queue."""
-FRESH_S = 0.1
-"""Seconds for which a text of the metrics is served again."""
+FRESH_S, FRESH_TIMES, FRESH_MOST_S = 0.1, 20, 1.0
+"""A text of the metrics is served again for FRESH_S, or FRESH_TIMES as long as it took, FRESH_MOST_S at most."""
 REQUEST_BYTES = 8192
 _LINE = re.compile(rb"(?P<method>[A-Z]{1,16}) (?P<path>/[!-~]{0,1024}) HTTP/1\.[0-9]\r?\n")
 _BEGINS = re.compile(rb"[A-Z]{1,16}(?: (?:/[!-~]*(?: [!-~]*\r?)?)?)?")
@@ -99,7 +100,7 @@ class MetricsServer:
         """The sockets at which this endpoint listens, with the timer of a pause."""
         self._sweep: asyncio.TimerHandle | None = None
         self._text: asyncio.Task[bytes] | None = None
-        self._read_at = -FRESH_S
+        self._fresh_until = -math.inf
         self._tasks = Tasks()
 
     def __repr__(self) -> str:
@@ -187,7 +188,7 @@ class MetricsServer:
                 client.send(HTTPStatus.NOT_FOUND, b"see /metrics, /healthz, /readyz\n")
 
     async def _show_metrics(self, client: _Client) -> None:
-        if self._text is None or (self._text.done() and self._loop.time() >= self._read_at + FRESH_S):
+        if self._text is None or (self._text.done() and self._loop.time() >= self._fresh_until):
             self._text = self._loop.create_task(self._write())
         try:
             body = await asyncio.shield(self._text)
@@ -198,9 +199,11 @@ class MetricsServer:
             client.send(HTTPStatus.OK, body)
 
     async def _write(self) -> bytes:
-        text = await self._read()
-        self._read_at = self._loop.time()
-        return text.encode()
+        begun = self._loop.time()
+        text = (await self._read()).encode()
+        now = self._loop.time()
+        self._fresh_until = now + min(FRESH_MOST_S, max(FRESH_S, FRESH_TIMES * (now - begun)))
+        return text
 
 
 class _Client:

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from zbridge import cli
+from zbridge.app.config import LogSettings
 from zbridge.errors import ConfigError
 from zbridge.host.settings import HostFile, HostSettings
 from zbridge.host.together import Together
@@ -52,6 +53,28 @@ def test_a_faulty_file_is_reported_and_the_other_robots_run(tmp_path: Path, serv
     cli.run_together(written(tmp_path, a=ROBOT.format("r1", ""), b="[robto]", c=ROBOT.format("r3", "")), HOST)
     assert served == [{"r1", "r3"}]
     assert "b.toml: robto = {}: unknown key" in caplog.text
+
+
+JSON = '[log]\nformat = "json"\n'
+
+
+@pytest.mark.parametrize(
+    ("host", "files", "form"),
+    [
+        (LogSettings(), (JSON, JSON), "json"),
+        (LogSettings(), (JSON, ""), None),
+        (LogSettings("console"), (JSON, JSON), "console"),
+    ],
+    ids=["as all files say", "the files differ", "as the host says"],
+)
+def test_robots_of_one_process_have_one_log(
+    host: LogSettings, files: tuple[str, str], form: str | None, tmp_path: Path, served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[LogSettings] = []
+    monkeypatch.setattr(cli, "set_up_log", lambda *, verbose, settings: asked.append(settings))
+    first, second = (ROBOT.format(name, more) for name, more in zip(("r1", "r2"), files, strict=True))
+    cli.run_together(written(tmp_path, a=first, b=second), HostFile(HOST.host, host))
+    assert asked[-1].format == form
 
 
 @pytest.mark.parametrize(

@@ -29,6 +29,8 @@ log = Log("zbridge.cli")
 
 FOLD_S = 10.0
 """Seconds of a window."""
+POLL_S = 1.0
+"""Longest wait of the timer thread: an older window may meanwhile get its first count."""
 KEYS = 256
 """Most kinds that are counted apart; all others share one window."""
 SUBJECTS = ("session", "peer", "file", "pid", "warning", "violation")
@@ -155,7 +157,7 @@ class LogHandler(logging.StreamHandler[TextIO]):
     def _run_timer(self) -> None:
         signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())  # the main thread waits for them
         deadline = self._write_counts()
-        while deadline is not None and not self._closing.wait(max(0.0, deadline - self._clock())):
+        while deadline is not None and not self._closing.wait(min(max(0.0, deadline - self._clock()), POLL_S)):
             deadline = self._write_counts()
 
 

@@ -30,6 +30,7 @@ from tests.robot.scene import (
     serving,
 )
 from zbridge.bus import PriorityClass, Sample
+from zbridge.control.events import StopCause
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.errors import Malformed, RateLimited
 from zbridge.fleet import topics
@@ -588,7 +589,7 @@ async def test_the_audit_log_tells_who_drove_what_was_refused_and_what_stopped_t
     assert {json.loads(line)["robot"] for line in rig.audit_lines} == {"r1"}
     counted = {(name, labels[0][1]): value for name, labels, value in rig.metrics if name in ("lease_changes", "stops")}
     changes = {"acquired": 2, "ended": 1, "taken_over": 1, "released": 1}
-    causes = {"deadman": 1, "taken_over": 1, "command": 1, "robot_lost": 1}
+    causes = {**dict.fromkeys(StopCause, 0), "deadman": 1, "taken_over": 1, "command": 1, "robot_lost": 1}
     assert counted == {("lease_changes", change): count for change, count in changes.items()} | {
         ("stops", cause): count for cause, count in causes.items()
     }

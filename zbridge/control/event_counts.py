@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from zbridge.control.events import AuthorityEvent, EventKind
+from zbridge.control.events import AuthorityEvent, EventKind, StopCause
 from zbridge.errors import Code
 from zbridge.metrics import Count, Metrics
 
@@ -16,11 +16,19 @@ _LATCHES = {EventKind.LATCHED: "latched", EventKind.UNLATCHED: "unlatched"}
 
 
 class EventCounts:
-    """The counters of one robot's events."""
+    """The counters of one robot's events.
+
+    Those of changes and stops exist from the start: Prometheus sees no increase in a series that begins with 1.
+    """
 
     def __init__(self, metrics: Metrics) -> None:
         self._metrics = metrics
         self._refused: dict[Code | None, Count] = {}
+        self._stops = {cause: metrics.count("stops", cause=cause) for cause in StopCause}
+        self._changes = {
+            **{kind: metrics.count("lease_changes", change=change) for kind, change in _LEASE.items()},
+            **{kind: metrics.count("latch_changes", change=change) for kind, change in _LATCHES.items()},
+        }
 
     def __repr__(self) -> str:
         return f"<EventCounts {sum(count.value for count in self._refused.values())} refused>"
@@ -36,9 +44,7 @@ class EventCounts:
         """Count one event."""
         if event.what is EventKind.REFUSED:
             self.refused(event.code)
-        elif event.what in _LEASE:
-            self._metrics.count("lease_changes", change=_LEASE[event.what]).value += 1
-        elif event.what in _LATCHES:
-            self._metrics.count("latch_changes", change=_LATCHES[event.what]).value += 1
+        elif event.what in self._changes:
+            self._changes[event.what].value += 1
         if event.cause is not None:
-            self._metrics.count("stops", cause=event.cause).value += 1
+            self._stops[event.cause].value += 1

@@ -65,8 +65,8 @@ PANELS = (
     ),
     Panel(
         "Robots by state",
-        "down: the robot's gateway has no process.",
-        {"{{state}}": "sum by (state) (zbridge_gateway_state{S})"},
+        "Robots in each state, and robots without a gateway that answers.",
+        {"{{state}}": "sum by (state) (zbridge_robot_state{S})", "no gateway": "sum(1 - zbridge_gateway_up{S})"},
     ),
     Panel(
         "Gateways",
@@ -147,7 +147,7 @@ PANELS = (
     ),
     Panel(
         "From the robot's socket to the bus",
-        "Of one read of eight.",
+        "Of 20 reads a second of each robot at most.",
         _quantiles("zbridge_socket_to_bus_seconds"),
         "s",
         width=12,
@@ -161,14 +161,14 @@ PANELS = (
     ),
     Panel(
         "Processor",
-        "Of one core.",
-        {"{{robot}}": f"topk(10, {_rate('process_cpu_seconds_total', 'realm', 'robot')})"},
+        "Of one core. A process without a robot is a supervisor, or serves several robots.",
+        {"{{robot}} at {{instance}}": f"topk(10, {_rate('process_cpu_seconds_total', 'instance', 'realm', 'robot')})"},
         "percentunit",
     ),
     Panel(
         "Memory",
         "Resident memory; processes share some of it.",
-        {"{{robot}}": "topk(10, max by (realm, robot) (process_resident_memory_bytes{S}))"},
+        {"{{robot}} at {{instance}}": "topk(10, process_resident_memory_bytes{S})"},
         "bytes",
     ),
     Panel(

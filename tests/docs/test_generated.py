@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 
 from docs.generate.__main__ import DOCS, PART, generated, rewritten
 from docs.generate.bus import declared
-from docs.generate.metrics import causes_of_stops
+from docs.generate.metrics import causes_of_stops, of_protocols
 from zbridge.control.events import StopCause
+from zbridge.metrics.families import FAMILIES
 
 ROOT = DOCS.parent
 PARTS = generated()
@@ -40,6 +42,12 @@ def test_every_key_has_its_place_in_the_table_of_its_class() -> None:
 
 
 # Metrics
+
+
+@pytest.mark.parametrize("page", sorted(DOCS.rglob("*.md")), ids=lambda page: str(page.relative_to(DOCS)))
+def test_every_metric_that_a_page_names_exists(page: Path) -> None:
+    known = {family.full_name for family in (*FAMILIES.values(), *of_protocols())}
+    assert set(re.findall(r"\bzbridge_\w+_(?:total|seconds|bytes)\b", page.read_text())) <= known
 
 
 def test_every_cause_of_a_stop_is_explained() -> None:

@@ -219,7 +219,7 @@ class Gateway:
         return GatewayStats(robot, self.metrics, usage, listeners, runtime.clock, runtime.clock_ns)
 
     def _readings(self) -> Iterator[Reading]:
-        yield "bus_connected", {}, int(self._on_the_bus)
+        yield "bus_connected", {}, int(self._on_the_bus or self._plan.config.bus.alone_is_normal)
         yield from session_readings(self.sessions)
         if self._plan.device is not None:
             yield from robot_readings(self.restarts.device, self._plan.device.protocol.name)

@@ -324,4 +324,4 @@ class Reporter(Observer):
             with in_memory("zbridge metrics", _encode(self.metrics())) as descriptor:
                 self._channel.send(MetricsRead(number), [descriptor])
         except Exception:
-            log.exception("metrics_unreadable", "the metrics cannot be read")
+            log.exception("metrics_not_answered", "the metrics cannot be read: the supervisor gets none")

@@ -114,7 +114,10 @@ GROUPS: dict[str, tuple[Family, ...]] = {
     ),
     "Bus": (
         *_gauges(
-            ("bus_connected", "1 while the process is connected to another one on the bus."),
+            (
+                "bus_connected",
+                "1 while the process is connected to another one on the bus, or a peer that may be alone.",
+            ),
             ("queue_length", "Messages that wait in a queue.", "queue"),
         ),
         *_counters(

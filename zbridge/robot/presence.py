@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import socket
+from itertools import product
 from typing import Any
 
 from msgspec import UNSET
@@ -16,6 +17,7 @@ from zbridge.errors import Refused
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Status
 from zbridge.log import Log
+from zbridge.metrics import Count
 from zbridge.protocol.session import Session, State
 from zbridge.robot.commands import LINK_BLOCKED, Commands
 from zbridge.robot.connection import Links
@@ -55,6 +57,8 @@ class Presence:
         self._leaving = False
         self._lost = context.metrics.count("commands_lost")
         self._stalls = context.metrics.count("link_stalls")
+        for link, outcome in product(context.robot.link_names, ("established", "failed", "lost")):
+            self._connections(link, outcome)
 
     def __repr__(self) -> str:
         return f"<Presence {self._context.keys.robot} {self._links.first.state}>"
@@ -86,7 +90,10 @@ class Presence:
 
     def count_connection(self, link: str, outcome: str) -> None:
         """Count a connection that was established, failed before that, or was lost after it."""
-        self._context.metrics.count("robot_connections", link=link, outcome=outcome).value += 1
+        self._connections(link, outcome).value += 1
+
+    def _connections(self, link: str, outcome: str) -> Count:
+        return self._context.metrics.count("robot_connections", link=link, outcome=outcome)
 
     def stalled(self, name: str, stalled: bool) -> None:
         """Drive no robot whose first link is stalled: it would obey late, or lose its stop with the rest."""

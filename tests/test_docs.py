@@ -32,8 +32,8 @@ BLOCK = re.compile(r"^```\w*[^\n`]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 TITLE = re.compile(r'^```\w* title="([^"]+)"', re.MULTILINE)
 
 GROUPS = ("zbridge.protocols", "zbridge.service")
+"""Dotted names that are no modules: the entry-point group, the unit of systemd."""
 LOGGERS = {call.logger for call in log_calls()}
-"""Dotted names that are no modules: the entry-point group, the unit of systemd, a logger."""
 THEIRS = (
     *("users.toml", "hq.toml", "r1.toml", "r2.toml", "e1.toml", "host.toml", "router.toml", "roles.toml", "bus.toml"),
     *("pyproject.toml", "README.md", "CHANGELOG.md"),

@@ -48,7 +48,7 @@ SHARED_TEMPLATE = """\
 """
 METRICS_TEMPLATE = """\
 # [metrics]
-# listen = "127.0.0.1:9100"             # counters for Prometheus
+# listen = "127.0.0.1:9100"             # metrics for Prometheus
 """
 LOG_TEMPLATE = """
 # [log]                                 # on stderr: docs/how-to/logs.md

@@ -90,10 +90,11 @@ def test_robots_sessions_peers_files_and_levels_are_told_apart_and_ports_are_not
             log.warning("failed", "{robot} failed", robot=robot)
             log.error("faulty", "{file} is faulty", file=f"{robot}.toml")
             log.error("died", "{session}", session=robot)
+            log.error("refused", "{reason}", reason=robot)
     token = current_robot.set("r3")
     log.error("failed", "in another robot's code")
     current_robot.reset(token)
-    assert len(written.take()) == 2 + 2 * 4 + 1
+    assert len(written.take()) == 2 + 2 * 5 + 1
 
 
 def test_plain_records_fold_by_their_templates(written: Written) -> None:

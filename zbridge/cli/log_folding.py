@@ -33,7 +33,7 @@ POLL_S = 1.0
 """Longest wait of the timer thread: an older window may meanwhile get its first count."""
 KEYS = 256
 """Most kinds that are counted apart; all others share one window."""
-SUBJECTS = ("session", "peer", "file", "pid", "warning", "violation")
+SUBJECTS = ("session", "peer", "file", "pid", "reason", "warning", "violation")
 """Fields that tell two records of one event apart."""
 _PORT = re.compile(r":\d+$")
 _KEY_CHARACTERS = 200

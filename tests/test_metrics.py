@@ -14,7 +14,7 @@ import pytest
 
 from tests.scraped import samples
 from zbridge.metrics import FAMILIES, Metrics
-from zbridge.metrics.exposition import FamilyLines, text, written
+from zbridge.metrics.exposition import FamilyLines, InvalidMetrics, checked, text, written
 from zbridge.metrics.registry import OTHER, SERIES, UNDOCUMENTED
 
 ROOT = Path(__file__).parents[1]
@@ -89,15 +89,47 @@ def test_a_duration_counts_in_its_bucket_and_all_above_it(duration_s: float, le:
     assert math.isclose(total, duration_s)
 
 
-def test_other_labels_than_the_metric_has_are_an_error() -> None:
+def test_a_metric_of_the_table_has_its_kind_and_labels_and_one_of_a_protocol_any() -> None:
     metrics = Metrics()
     for labels in ({}, {"why": "x"}, {"code": "held", "why": "x"}):
-        with pytest.raises(ValueError, match="refused has the labels"):
+        with pytest.raises(ValueError, match="refused is a counter of zbridge itself with the labels code"):
             metrics.count("refused", **labels)
+    with pytest.raises(ValueError, match="latches is a gauge of zbridge itself: expected another name"):
+        metrics.count("latches")
+    with pytest.raises(ValueError, match="refused is a counter"):
+        metrics.histogram("refused", code="held")
     metrics.count("own", link="a")
-    with pytest.raises(ValueError, match="own has the labels"):
-        metrics.count("own")
+    metrics.count("own").value += 1
     assert f"# HELP zbridge_own_total {UNDOCUMENTED}" in metrics.exposition()
+    assert len(samples(metrics.exposition())) == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "label"), [("my-counter", "a"), ("a b", "a"), ("", "a"), ("own", "bad-label"), ("own", "realm")]
+)
+def test_a_name_that_would_spoil_the_text_is_an_error(name: str, label: str) -> None:
+    metrics = Metrics().labelled(realm="fleet")
+    with pytest.raises(ValueError, match="expected the name of a metric or label"):
+        metrics.count(name, **{label: "x"})
+    assert metrics.exposition() == ""
+
+
+@pytest.mark.parametrize(
+    "family",
+    [
+        FamilyLines("a b", "counter", "Help.", "a b 1\n"),
+        FamilyLines("zbridge_a", "number", "Help.", "zbridge_a 1\n"),
+        FamilyLines("zbridge_a", "gauge", "Help.", "zbridge_a 1\nnonsense\n"),
+        FamilyLines("zbridge_a", "gauge", "Help.", "zbridge_a 1\nzbridge_gateway_up 0\n"),
+    ],
+)
+def test_what_another_process_says_must_not_spoil_the_text_of_all(family: FamilyLines) -> None:
+    sound = FamilyLines("zbridge_a", "gauge", "Help\n# TYPE b.", 'zbridge_a{b="\\n"} 1\nzbridge_a 2\n')
+    assert checked([sound]) == [sound]
+    with pytest.raises(InvalidMetrics):
+        checked([sound, family])
+    with pytest.raises(InvalidMetrics, match="513 metrics exceed 512"):
+        checked([sound] * 513)
 
 
 def test_names_without_end_in_a_label_take_bounded_memory_and_are_counted_together() -> None:

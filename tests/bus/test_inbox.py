@@ -8,8 +8,10 @@ from typing import Any
 
 import pytest
 
+from tests.scraped import samples
 from zbridge.bus import PriorityClass
 from zbridge.bus.inbox import QUEUE, QUEUE_BYTES, SHARES, Inbox, Source
+from zbridge.log import current_robot
 from zbridge.metrics import Metrics
 
 
@@ -156,6 +158,34 @@ async def test_a_handler_that_fails_is_logged_and_the_next_item_comes(rig: Rig, 
     with caplog.at_level(logging.ERROR):
         assert await rig.drained() == [2]
     assert "ZeroDivisionError" in caplog.text
+
+
+async def test_handlers_run_as_code_of_the_gateway_that_made_the_inbox_whoever_serves_it() -> None:
+    robots, seen = ("r1", "r2"), list[str]()
+    rigs = {}
+    for robot in robots:
+        token = current_robot.set(robot)
+        rigs[robot] = Rig()
+        current_robot.reset(token)
+    for robot, made in rigs.items():
+        source = made.inbox.source(lambda raw: seen.append(f"{raw} {current_robot.get()}"))
+        source.put(f"stop of {robot}", PriorityClass.STOP)
+    token = current_robot.set("r3")
+    for made in rigs.values():
+        made.inbox.attend()
+    assert current_robot.get() == "r3"
+    current_robot.reset(token)
+    assert seen == ["stop of r1 r1", "stop of r2 r2"]
+
+
+async def test_how_long_a_command_waits_and_is_handled_is_measured(rig: Rig) -> None:
+    rig.put([1, 2], PriorityClass.OTHER)
+    rig.put([3], PriorityClass.COMMAND)
+    rig.put([4], PriorityClass.STOP)
+    await rig.drained()
+    counts = {name: value for (name, _), value in samples(rig.metrics.exposition()).items()}
+    assert counts["zbridge_bus_to_socket_seconds_count"] == 2
+    assert 0 < counts["zbridge_bus_to_socket_seconds_sum"] < 10
 
 
 def test_an_item_for_a_loop_that_has_ended_is_no_error() -> None:

@@ -105,6 +105,29 @@ def test_plain_records_fold_by_their_templates(written: Written) -> None:
     assert written.take() == ["slow: 0", "text 0", "text 1"]
 
 
+def test_different_exceptions_of_one_event_are_all_written(written: Written) -> None:
+    for error in (KeyError("a"), KeyError("b"), ValueError("a"), KeyError("a")):
+        try:
+            raise error
+        except (KeyError, ValueError):
+            log.exception("failed", "a handler failed")
+    lines = written.take()
+    assert [line for line in lines if line.startswith(("KeyError", "ValueError"))] == [
+        "KeyError: 'a'",
+        "KeyError: 'b'",
+        "ValueError: a",
+    ]
+
+
+def test_a_crowd_of_one_kind_hides_no_other_event(written: Written) -> None:
+    for number in range(KEYS + 100):
+        log.warning("refused", "{peer} refused", peer=f"host{number}:1")
+    written.take()
+    log.error("not_written", "the disk is full")
+    log.warning("stalled", "{robot} is stalled", robot="r1")
+    assert written.take() == ["the disk is full", "r1 is stalled"]
+
+
 def test_kinds_without_end_share_one_count(written: Written) -> None:
     for number in range(KEYS + 500):
         log.warning("refused", "{peer} refused", peer=f"host{number}:1")

@@ -32,8 +32,8 @@ def served(monkeypatch: pytest.MonkeyPatch) -> list[set[str]]:
 
     made = Together.__init__
 
-    def init(self: Together, plans: dict[str, Any], host: HostSettings) -> None:
-        made(self, plans, host)
+    def init(self: Together, plans: dict[str, Any], host: HostSettings, **more: Any) -> None:
+        made(self, plans, host, **more)
         served.append(set(plans))
 
     monkeypatch.setattr(cli, "run_loop", run_loop)

@@ -5,6 +5,7 @@ import random
 import pytest
 
 from tests.protocol.test_session import LIMITS, Toy
+from zbridge.protocol.session import Role
 from zbridge.protocol.session_table import REMEMBERED, Backoff, ClientIds, SessionTable
 
 
@@ -29,6 +30,20 @@ def test_the_table_remembers_a_bounded_number_of_ended_sessions() -> None:
         table.add(session)
         table.remove(session)
     assert [shown.name for shown in table.snapshots()] == [str(number) for number in range(5, REMEMBERED + 5)]
+
+
+def test_what_sessions_carried_is_summed_but_for_what_they_had_carried_in_another_process() -> None:
+    table, ours, taken_over = SessionTable(), Toy(LIMITS), Toy(LIMITS)
+    taken_over.traffic.bytes_in = 1000
+    for session in (ours, taken_over):
+        table.add(session)
+        session.traffic.bytes_in += 5
+    other = {Role.HQ: Role.ROBOT, Role.ROBOT: Role.HQ}[ours.role]
+    assert [table.carried(role).bytes_in for role in (ours.role, other)] == [10, 0]
+    table.remove(taken_over)
+    table.remove(taken_over)
+    ours.traffic.bytes_in += 1
+    assert table.carried(ours.role).bytes_in == 11
 
 
 def test_delays_double_up_to_the_most_and_a_reset_begins_anew() -> None:

@@ -4,10 +4,11 @@
 process is of use now, else 503 with the reasons, one a line.
 
 Theory of operation. Clients are accepted in batches with a pause between them, so that a flood takes a bounded part of
-the event loop's time. A client costs one descriptor and no task, and has :data:`REQUEST_S` to send its request. Where
-more than :data:`CLIENTS` are connected, the oldest client of the address that has most of them is closed: a thousand
-clients that say nothing keep no scrape waiting. What is no request is refused with its first bytes. All who ask for the
-metrics within a moment get the same text, so that reading them takes a twentieth of the event loop's time at most.
+the event loop's time. A client costs one descriptor, at most :data:`SEND_BYTES` of the kernel's memory, and no task,
+and has :data:`REQUEST_S` to send its request. Where more than :data:`CLIENTS` are connected, the one of the busiest
+address is closed that has sent or read nothing for longest, but none that waits for its answer. So a thousand slow
+clients keep no scrape waiting. What is no request is refused with its first bytes. All who ask for the metrics within a
+moment get the same text.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from http import HTTPStatus
 
+from zbridge.app.process_usage import most_files
 from zbridge.log import Log
 from zbridge.metrics import Metrics
 from zbridge.metrics.exposition import CONTENT_TYPE
@@ -33,7 +35,7 @@ log = Log("zbridge.metrics")
 REQUEST_S = 2.0
 """Longest time for a request, and for a client to read some of its answer."""
 CLIENTS = 256
-"""Clients at a time."""
+"""Clients at a time; fewer where the process may not have four times as many descriptors."""
 BATCH, PAUSE_S = 8, 0.005
 """Clients that are accepted at once, and seconds to the next ones."""
 WAITING = 1024
@@ -41,6 +43,8 @@ WAITING = 1024
 FRESH_S, FRESH_TIMES, FRESH_MOST_S = 0.1, 20, 1.0
 """A text of the metrics is served again for FRESH_S, or FRESH_TIMES as long as it took, FRESH_MOST_S at most."""
 REQUEST_BYTES = 8192
+SEND_BYTES = 64 * 1024
+"""Most bytes of an answer that wait in the kernel: all that a client which reads nothing can take."""
 _LINE = re.compile(rb"(?P<method>[A-Z]{1,16}) (?P<path>/[!-~]{0,1024}) HTTP/1\.[0-9]\r?\n")
 _BEGINS = re.compile(rb"[A-Z]{1,16}(?: (?:/[!-~]*(?: [!-~]*\r?)?)?)?")
 """What an unfinished first line may look like."""
@@ -95,19 +99,22 @@ class MetricsServer:
         self._missing = missing
         self._clients: dict[_Client, None] = {}
         """Those that are connected, the oldest first."""
-        self._hosts = Counter[str]()
         self._pauses: dict[socket.socket, asyncio.TimerHandle | None] = {}
         """The sockets at which this endpoint listens, with the timer of a pause."""
         self._sweep: asyncio.TimerHandle | None = None
         self._text: asyncio.Task[bytes] | None = None
         self._fresh_until = -math.inf
         self._tasks = Tasks()
+        self._most = min(CLIENTS, most_files() // 4 or CLIENTS)
 
     def __repr__(self) -> str:
         return f"<MetricsServer of {len(self._clients)} clients>"
 
     def listen(self, listening: socket.socket) -> None:
-        """Accept clients at a socket that does not block."""
+        """Accept clients at a socket that does not block; they inherit its bounds."""
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BYTES)
+        if hasattr(socket, "TCP_USER_TIMEOUT"):
+            listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(1000 * REQUEST_S))
         self._pauses[listening] = None
         self._loop.add_reader(listening, self._accept, listening)
 
@@ -126,26 +133,31 @@ class MetricsServer:
         await self._tasks.end()
 
     def _accept(self, listening: socket.socket) -> None:
-        pause_s = PAUSE_S
         for _ in range(BATCH):
+            if len(self._clients) >= self._most and not self._make_room():
+                break
             try:
                 connection, (host, *_) = listening.accept()
             except BlockingIOError:
                 return
             except OSError as error:  # no descriptor left: an immediate retry would use up the processor
                 log.debug("metrics_accept_failed", "metrics endpoint: {error}", error=error)
-                pause_s = REQUEST_S
+                self._make_room()
                 break
             self._admit(connection, host)
         self._loop.remove_reader(listening)
-        self._pauses[listening] = self._loop.call_later(pause_s, self.listen, listening)
+        self._pauses[listening] = self._loop.call_later(PAUSE_S, self.listen, listening)
+
+    def _make_room(self) -> bool:
+        """Close the client that has done nothing for longest; False if all wait for an answer, which comes soon."""
+        idle = [client for client in self._clients if not client.waits]
+        if idle:
+            busiest, _ = Counter(client.host for client in idle).most_common(1)[0]
+            next(client for client in idle if client.host == busiest).close()
+        return bool(idle)
 
     def _admit(self, connection: socket.socket, host: str) -> None:
-        if len(self._clients) >= CLIENTS:
-            most, _ = self._hosts.most_common(1)[0]
-            next(client for client in self._clients if client.host == most).close()
         connection.setblocking(False)
-        self._hosts[host] += 1
         client = _Client(self._loop, connection, host, self)
         self._clients[client] = None
         client.begin()
@@ -155,7 +167,6 @@ class MetricsServer:
     def forget(self, client: _Client) -> None:
         """Note that a client's connection is closed."""
         del self._clients[client]
-        self._hosts -= Counter((client.host,))
 
     def prolong(self, client: _Client) -> None:
         """Give a client its time anew: it reads its answer."""
@@ -214,12 +225,14 @@ class _Client:
     ) -> None:
         self.host = host
         self.since = loop.time()
+        self.waits = False
+        """Whether it has asked, and its answer is being made."""
         self._loop = loop
         self._connection = connection
         self._endpoint = endpoint
         self._request = b""
-        self._left = memoryview(b"")
-        """What is still to be sent."""
+        self._left: list[memoryview] = []
+        """What is still to be sent; all clients share the text of the metrics."""
         self._bodiless = False
 
     def begin(self) -> None:
@@ -240,7 +253,8 @@ class _Client:
         if self._connection.fileno() < 0:
             return
         self._loop.remove_reader(self._connection)
-        self._left = memoryview(response(status, body, bodiless=self._bodiless))
+        self.waits = False
+        self._left = [memoryview(head_of(status, body)), memoryview(b"" if self._bodiless else body)]
         self._loop.add_writer(self._connection, self._write)
         self._write()
 
@@ -261,13 +275,16 @@ class _Client:
         elif found is not None:
             self._loop.remove_reader(self._connection)
             method, path = found
-            self._bodiless = method == "HEAD"
+            self._bodiless, self.waits = method == "HEAD", True
             self._endpoint.answer(self, path)
 
     def _write(self) -> None:
         try:
             while self._left:
-                self._left = self._left[self._connection.send(self._left) :]
+                sent = self._connection.send(self._left[0])
+                self._left[0] = self._left[0][sent:]
+                if not self._left[0]:
+                    self._left.pop(0)
                 self._endpoint.prolong(self)
             self._connection.shutdown(socket.SHUT_WR)
         except BlockingIOError:
@@ -291,10 +308,9 @@ def parse(request: bytes) -> tuple[str, str] | HTTPStatus | None:
     return None if len(request) <= REQUEST_BYTES else HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE
 
 
-def response(status: HTTPStatus, body: bytes, *, bodiless: bool = False) -> bytes:
-    """Write an answer. bodiless: to a request of HEAD."""
-    head = (
+def head_of(status: HTTPStatus, body: bytes) -> bytes:
+    """Write the head of an answer."""
+    return (
         f"HTTP/1.0 {status.value} {status.phrase}\r\nContent-Type: {CONTENT_TYPE}\r\n"
         f"Content-Length: {len(body)}\r\nConnection: close\r\n\r\n"
-    )
-    return head.encode() + (b"" if bodiless else body)
+    ).encode()

@@ -127,7 +127,7 @@ class _Slow:
     def read_files(self) -> None:
         with suppress(OSError):
             self.files = len(os.listdir("/proc/self/fd"))
-        self.most_files = _most_files()
+        self.most_files = most_files()
 
 
 def free_bytes(path: Path) -> int | None:
@@ -139,7 +139,8 @@ def free_bytes(path: Path) -> int | None:
     return None
 
 
-def _most_files() -> int:
+def most_files() -> int:
+    """Return how many descriptors this process may have; 0 where the platform does not say."""
     try:
         import resource
     except ImportError:

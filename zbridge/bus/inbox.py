@@ -22,7 +22,7 @@ from collections.abc import Callable
 from typing import Any
 
 from zbridge.bus.interface import PriorityClass
-from zbridge.log import Log
+from zbridge.log import Log, current_robot
 from zbridge.metrics import Count, Histogram, Metrics
 
 log = Log("zbridge.bus")
@@ -52,6 +52,8 @@ class Inbox:
         self._dropped = metrics.count("bus_dropped", queue="bus_in")
         self._folded = metrics.count("bus_stops_folded")
         self._metrics = metrics
+        self._robot = current_robot.get()
+        """Of the gateway that made this, where several share a process: an inbox also serves those of the others."""
         self._handled: Histogram | None = None
         """From arrival until the handler has returned; made with the first command."""
 
@@ -111,10 +113,14 @@ class Inbox:
         if queue.items and not queue.listed:
             queue.listed = True
             line.append(queue)
+        serving = current_robot.set(self._robot) if self._robot else None
         try:
             source.handler(raw if source.read is None else source.read(raw))
         except Exception:
             log.exception("handler_failed", "a handler failed")
+        finally:
+            if serving is not None:
+                current_robot.reset(serving)
         if at:
             if self._handled is None:
                 self._handled = self._metrics.histogram("bus_to_socket_seconds")

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import re
 import signal
 import sys
@@ -32,13 +33,15 @@ FOLD_S = 10.0
 POLL_S = 1.0
 """Longest wait of the timer thread: an older window may meanwhile get its first count."""
 KEYS = 256
-"""Most kinds that are counted apart; all others share one window."""
-SUBJECTS = ("session", "peer", "file", "pid", "reason", "warning", "violation")
+"""Most kinds that are counted apart; all others share one window for each event."""
+SUBJECTS = ("session", "peer", "file", "pid", "reason", "error", "warning", "violation")
 """Fields that tell two records of one event apart."""
 _PORT = re.compile(r":\d+$")
 _KEY_CHARACTERS = 200
 
 Key = tuple[str, ...]
+_EVENT = 3
+"""Parts of a key that say what happened; the others say to whom."""
 _OTHERS: Key = ()
 
 
@@ -67,8 +70,8 @@ class WarningFolds:
     def admit(self, record: logging.LogRecord, now: float) -> bool:
         """Return whether a record is to be written now; otherwise it is counted. Call :meth:`due` before."""
         key = _key(record)
-        if key not in self._windows and len(self._windows) >= KEYS:
-            key = _OTHERS
+        wider = ((key, KEYS), (key[:_EVENT], 2 * KEYS), (_OTHERS, math.inf))
+        key = next(each for each, most in wider if each in self._windows or len(self._windows) < most)
         window = self._windows.get(key)
         if window is None:
             self._windows[key] = _Window(now)
@@ -150,9 +153,10 @@ class LogHandler(logging.StreamHandler[TextIO]):
 
     def _start_timer(self) -> None:
         if self._timer is None and not self._closing.is_set():
-            self._timer = threading.Thread(target=self._run_timer, name="zbridge-log", daemon=True)
-            with contextlib.suppress(RuntimeError):  # no thread to be had: the next warning writes the counts
-                self._timer.start()
+            timer = threading.Thread(target=self._run_timer, name="zbridge-log", daemon=True)
+            with contextlib.suppress(RuntimeError):  # no thread to be had: the next warning tries again
+                timer.start()
+                self._timer = timer
 
     def _run_timer(self) -> None:
         signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())  # the main thread waits for them
@@ -166,7 +170,8 @@ def _key(record: logging.LogRecord) -> Key:
     fields: Mapping[str, object] = getattr(record, "fields", {})
     subjects = (_PORT.sub("", str(fields[name])) if name in fields else "" for name in SUBJECTS)
     what = getattr(record, "event", None) or (record.getMessage() if record.msg == "%s" else str(record.msg))
-    parts = (record.name, record.levelname, what, str(getattr(record, "robot", "")), *subjects)
+    error = describe(record.exc_info[1]) if record.exc_info and record.exc_info[1] is not None else ""
+    parts = (record.name, record.levelname, what, str(getattr(record, "robot", "")), error, *subjects)
     return tuple(part[:_KEY_CHARACTERS] for part in parts)
 
 

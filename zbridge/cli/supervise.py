@@ -7,6 +7,8 @@ import gc
 import os
 from pathlib import Path
 
+from msgspec import structs
+
 from zbridge.app import until_signal
 from zbridge.cli import set_up_log
 from zbridge.cli.logs import log_settings
@@ -15,6 +17,9 @@ from zbridge.host.fork_client import ForkClient, fork_server_command
 from zbridge.host.replacement import SupervisorState, restore
 from zbridge.host.settings import HostFile, load_host
 from zbridge.host.supervisor import Supervisor
+from zbridge.log import Log
+
+log = Log("zbridge.cli")
 
 
 def supervise(paths: tuple[Path, ...], *, watch: bool, verbose: bool) -> None:
@@ -22,11 +27,7 @@ def supervise(paths: tuple[Path, ...], *, watch: bool, verbose: bool) -> None:
     set_up_log()
     if missing := [path for path in paths if not path.exists()]:
         raise ConfigError(f"{missing[0]}: No such file or directory")
-    folders = [path for path in paths if path.is_dir()]
-    found = load_host(folders[0]) if len(folders) == 1 else HostFile()  # several files or folders: the defaults
-    log_format, log_level = found.log.format or "", found.log.level or ""
-    listen = found.metrics.listen if found.metrics is not None else ""
-    _run(SupervisorState(tuple(map(str, paths)), watch, verbose, found.host, log_format, log_level, listen))
+    _run(_with_host_file(SupervisorState(tuple(map(str, paths)), watch, verbose)))
 
 
 def resume(descriptor: int) -> None:
@@ -34,7 +35,25 @@ def resume(descriptor: int) -> None:
     set_up_log()
     state = restore(descriptor)
     os.close(descriptor)
+    try:
+        state = _with_host_file(state)
+    except ConfigError as error:
+        log.error("host_file_ignored", "{error}: the settings stay as they were", error=error)
     _run(state)
+
+
+def _with_host_file(state: SupervisorState) -> SupervisorState:
+    """Return the state with what ``host.toml`` says now; raise ConfigError. Sockets of another address are closed."""
+    folders = [path for path in map(Path, state.sources) if path.is_dir()]
+    found = load_host(folders[0]) if len(folders) == 1 else HostFile()  # several files or folders: the defaults
+    listen = found.metrics.listen if found.metrics is not None else ""
+    if listen != state.listen:
+        for descriptor in state.sockets:
+            os.close(descriptor)
+        state = structs.replace(state, sockets=())
+    return structs.replace(
+        state, host=found.host, log_format=found.log.format or "", log_level=found.log.level or "", listen=listen
+    )
 
 
 def _run(state: SupervisorState) -> None:

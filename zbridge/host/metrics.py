@@ -20,7 +20,7 @@ from zbridge.metrics import Metrics, Reading
 from zbridge.metrics.exposition import FamilyLines, text, written
 from zbridge.protocol.address import Address
 
-ANSWER_S = 0.5
+ANSWER_S = 0.4
 """Longest wait for the answers of all gateways."""
 
 

@@ -32,7 +32,7 @@ from zbridge.host.files import RobotFile
 from zbridge.host.replacement import ProcessState
 from zbridge.host.watchdog import Watchdog
 from zbridge.log import Log
-from zbridge.metrics.exposition import FamilyLines
+from zbridge.metrics.exposition import FamilyLines, InvalidMetrics, checked
 from zbridge.robot.observer import LastStop
 
 log = Log("zbridge.host")
@@ -43,7 +43,7 @@ _MESSAGES = 64
 """Most messages that are taken from one process before others are served."""
 _DRAINED = 64
 """The same, times :data:`_MESSAGES`, of a process that has ended: more than its socket holds."""
-METRICS_BYTES = 2 * 2**20
+METRICS_BYTES = 256 * 1024
 """Most bytes of the metrics of one process."""
 _decode_metrics = msgspec.msgpack.Decoder(list[FamilyLines]).decode
 
@@ -207,8 +207,8 @@ class GatewayProcess:
         if asked is None or asked.done() or number != self._question:
             return
         try:
-            asked.set_result(_decode_metrics(os.pread(descriptor, METRICS_BYTES, 0)))
-        except (OSError, msgspec.MsgspecError, UnicodeError, RecursionError) as error:
+            asked.set_result(checked(_decode_metrics(os.pread(descriptor, METRICS_BYTES, 0))))
+        except (OSError, msgspec.MsgspecError, InvalidMetrics, UnicodeError, RecursionError) as error:
             log.error("metrics_invalid", "process {pid} sent invalid metrics: {error}", pid=self.pid, error=error)
 
     @property

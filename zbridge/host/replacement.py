@@ -76,8 +76,9 @@ class SupervisorState(msgspec.Struct, frozen=True, tag_field="version", tag=VERS
     """What a supervisor runs; in place of other code also what that code knew.
 
     log_format, log_level: as in :class:`~zbridge.host.fd_channel.Fork`. listen: host:port of the metrics; empty: they
-    are not served. sockets: descriptors that listen there. at: the time of the replacement, None: this
-    supervisor was just started. is_ready: whether systemd knows that every gateway has begun.
+    are not served. sockets: descriptors that listen there. at: the time of the replacement, None: this supervisor was
+    just started. reload: whether SIGHUP came and is not yet answered. is_ready: whether systemd knows that every
+    gateway has begun.
     """
 
     sources: tuple[str, ...]
@@ -89,6 +90,7 @@ class SupervisorState(msgspec.Struct, frozen=True, tag_field="version", tag=VERS
     listen: str = ""
     sockets: tuple[int, ...] = ()
     at: float | None = None
+    reload: bool = False
     is_ready: bool = False
     runners: tuple[RunnerState, ...] = ()
     server: ServerState | None = None
@@ -151,8 +153,8 @@ async def replace(
 
 
 def _execute(command: Sequence[str], state: SupervisorState) -> NoReturn:
-    logging.shutdown()  # what is still counted of repeated warnings is written
     with in_memory("zbridge state", encode(state)) as descriptor:
         for number in (descriptor, *state.descriptors):
             os.set_inheritable(number, True)  # for this exec: every other program is started without them
+        logging.shutdown()  # what is still counted of repeated warnings is written
         os.execv(command[0], [*command, "--resume", str(descriptor)])

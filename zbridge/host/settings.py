@@ -38,8 +38,8 @@ class HostFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``host.toml``. metrics: of all gateways. log: of the supervisor, and of gateways whose files have no table."""
 
     host: HostSettings = HostSettings()
-    metrics: MetricsSettings | None = None
     log: LogSettings = LogSettings()
+    metrics: MetricsSettings | None = None
 
 
 def load_host(directory: Path) -> HostFile:

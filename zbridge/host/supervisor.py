@@ -183,6 +183,7 @@ class Supervisor:
         return msgspec.structs.replace(
             self._state,
             at=time.monotonic(),
+            reload=self._reload.is_set(),
             is_ready=self._reports.is_ready,
             sockets=tuple(each.fileno() for each in self._sockets),
             runners=tuple(runner.snapshot for runner in self.runners.by_path.values()),
@@ -195,6 +196,8 @@ class Supervisor:
         self._forks.resume(self._state.server)
         self.runners.check_at = at  # this process has checked no watchdog since
         self.runners.resume(self._state.runners)
+        if self._state.reload:
+            self._reload.set()
         signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
         taken_ms = (time.monotonic() - at) * 1000
         template = "the installed code has taken over in {took_ms:.0f} ms: {status}"

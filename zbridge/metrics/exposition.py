@@ -7,6 +7,7 @@ Source: https://prometheus.io/docs/instrumenting/exposition_formats/
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 
 import msgspec
@@ -14,6 +15,10 @@ import msgspec
 from zbridge.metrics.families import Family, MetricKind
 from zbridge.metrics.values import BOUNDS_S, Labels, Value
 
+FAMILIES_MOST = 512
+"""Most metrics of one process."""
+_NAME = re.compile(r"[a-zA-Z_][a-zA-Z0-9_]*")
+_KINDS = {kind.value for kind in MetricKind}
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 
 
@@ -24,6 +29,21 @@ class FamilyLines(msgspec.Struct, frozen=True, array_like=True):
     kind: str
     help: str
     lines: str
+
+
+class InvalidMetrics(ValueError):
+    """What another process says of its metrics is none of the text format."""
+
+
+def checked(families: list[FamilyLines]) -> list[FamilyLines]:
+    """Return the metrics of another process; raise InvalidMetrics if they would spoil those of all others."""
+    if len(families) > FAMILIES_MOST:
+        raise InvalidMetrics(f"{len(families)} metrics exceed {FAMILIES_MOST}")
+    for family in families:
+        named = _NAME.fullmatch(family.name) and family.kind in _KINDS
+        if not named or not all(line.startswith(family.name) for line in family.lines.splitlines()):
+            raise InvalidMetrics(f"{family.name[:80]!r} is not in the text format")
+    return families
 
 
 def written(metrics: Iterable[tuple[Family, list[tuple[Labels, Value]]]]) -> list[FamilyLines]:

@@ -92,7 +92,7 @@ GROUPS: dict[str, tuple[Family, ...]] = {
         Family(
             "bus_to_socket_seconds",
             MetricKind.HISTOGRAM,
-            "Time from the arrival of a command until it is carried out: written to the robot, or refused.",
+            "Time from the arrival of a command until it is handled: written or refused, or waiting for a slow robot.",
         ),
     ),
     "Control": (

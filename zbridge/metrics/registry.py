@@ -8,6 +8,7 @@ at all: a *source* reads it when somebody reads the metrics. An endpoint shows t
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Iterator
 
 from zbridge.metrics.exposition import text, written
@@ -17,6 +18,7 @@ from zbridge.metrics.values import Count, Histogram, Labels, Value
 SERIES = 256
 """Most combinations of labels of one metric; all others share one, whose label values are ``other``."""
 OTHER = "other"
+_NAME = re.compile(r"[a-zA-Z_][a-zA-Z0-9_]*")
 UNDOCUMENTED = "Counted by the protocol."
 """The help of a counter that its protocol gives none."""
 
@@ -48,7 +50,8 @@ class Metrics:
         """Return the counter of this name and these labels; make it on first use.
 
         help: what it counts, for a name that is not in :data:`FAMILIES`. Beyond :data:`SERIES` combinations of labels,
-        the counter is shared. Raises ValueError for other labels than the metric has.
+        the counter is shared. Raises ValueError for names that Prometheus does not allow, and for another kind or
+        other labels than a metric of the table has.
         """
         key = self._key(name, labels)
         count = self._counts.get(key)
@@ -111,11 +114,16 @@ class Metrics:
         return name, _sorted({**self._own, **labels})
 
     def _declare(self, name: str, kind: MetricKind, labels: dict[str, str], text: str = "") -> None:
+        """Check a new series against the table, or enter a metric that is not there."""
         family = FAMILIES.get(name)
         if family is None:
-            family = self._families.setdefault(name, Family(name, kind, text or UNDOCUMENTED, tuple(sorted(labels))))
-        if set(labels) != set(family.labels):
-            raise ValueError(f"{name} has the labels {sorted(family.labels)}, not {sorted(labels)}")
+            for word in (name, *labels):
+                if not _NAME.fullmatch(word) or word in self._own:
+                    raise ValueError(f"{word!r}: expected the name of a metric or label: letters, digits and '_'")
+            self._families.setdefault(name, Family(name, kind, text or UNDOCUMENTED, tuple(sorted(labels))))
+        elif (kind, set(labels)) != (family.kind, set(family.labels)):
+            labelled = f" with the labels {', '.join(family.labels)}" if family.labels else ""
+            raise ValueError(f"{name} is a {family.kind.value} of zbridge itself{labelled}: expected another name")
 
     def _bounded(self, name: str, key: tuple[str, Labels], labels: dict[str, str]) -> tuple[str, Labels]:
         """Return the key of a new series; that of all others if there are too many."""

@@ -79,7 +79,8 @@ class SessionTable:
     """The sessions of one process, of every protocol and both roles."""
 
     def __init__(self) -> None:
-        self._live: dict[Session[Any], None] = {}
+        self._live: dict[Session[Any], Traffic] = {}
+        """What each had carried when it was added: another process may have begun it, and has counted that."""
         self._ended: list[SessionEntry] = []
         self._past: dict[Role, Traffic] = {role: Traffic() for role in Role}
         """What sessions carried that have ended."""
@@ -89,25 +90,25 @@ class SessionTable:
 
     def add(self, session: Session[Any]) -> None:
         """Add a new session to the table."""
-        self._live[session] = None
+        self._live[session] = msgspec.structs.replace(session.traffic)
 
     def remove(self, session: Session[Any]) -> None:
         """Move an ended session to the :data:`REMEMBERED` ones; idempotent."""
-        if session in self._live:
-            del self._live[session]
+        before = self._live.pop(session, None)
+        if before is not None:
             self._ended = [*self._ended, session.snapshot()][-REMEMBERED:]
-            _add(self._past[session.role], session.traffic)
+            _add(self._past[session.role], session.traffic, before)
 
     def __iter__(self) -> Iterator[Session[Any]]:
         """Go through the live ones."""
         return iter(self._live)
 
     def carried(self, role: Role) -> Traffic:
-        """Sum what all sessions of one role have carried, also those that have ended."""
+        """Sum what all sessions of one role have carried in this process, also those that have ended."""
         total = msgspec.structs.replace(self._past[role])
-        for session in self._live:
+        for session, before in self._live.items():
             if session.role is role:
-                _add(total, session.traffic)
+                _add(total, session.traffic, before)
         return total
 
     def snapshots(self) -> tuple[SessionEntry, ...]:
@@ -115,6 +116,6 @@ class SessionTable:
         return (*(session.snapshot() for session in self._live), *self._ended)
 
 
-def _add(total: Traffic, more: Traffic) -> None:
+def _add(total: Traffic, now: Traffic, before: Traffic) -> None:
     for field in Traffic.__struct_fields__:
-        setattr(total, field, getattr(total, field) + getattr(more, field))
+        setattr(total, field, getattr(total, field) + getattr(now, field) - getattr(before, field))

@@ -276,6 +276,7 @@ async def test_the_log_holds_no_secret_at_the_level_debug(bench: Bench, tmp_path
     secrets.add("listener's key", (own / "key.pem").read_bytes()[40:120])
     with old_program(authority, port, secrets):
         until(lambda: (bench.fleet.last("r1/control").get("holder") or "").startswith("hq.desk."), what="the lease")
+        until(lambda: "hq_drives" in gateway.log, what="its line")
     until(lambda: bench.fleet.last("r1/control").get("holder") is None, what="its end")
     bench.fleet.hold()
     for number in range(3):

@@ -115,8 +115,7 @@ class MetricsServer:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BYTES)
         if hasattr(socket, "TCP_USER_TIMEOUT"):
             listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(1000 * REQUEST_S))
-        self._pauses[listening] = None
-        self._loop.add_reader(listening, self._accept, listening)
+        self._resume(listening)
 
     async def close(self) -> None:
         """Accept nobody, and close all clients."""
@@ -132,6 +131,10 @@ class MetricsServer:
             self._text.cancel()
         await self._tasks.end()
 
+    def _resume(self, listening: socket.socket) -> None:
+        self._pauses[listening] = None
+        self._loop.add_reader(listening, self._accept, listening)
+
     def _accept(self, listening: socket.socket) -> None:
         for _ in range(BATCH):
             if len(self._clients) >= self._most and not self._make_room():
@@ -146,7 +149,7 @@ class MetricsServer:
                 break
             self._admit(connection, host)
         self._loop.remove_reader(listening)
-        self._pauses[listening] = self._loop.call_later(PAUSE_S, self.listen, listening)
+        self._pauses[listening] = self._loop.call_later(PAUSE_S, self._resume, listening)
 
     def _make_room(self) -> bool:
         """Close the client that has done nothing for longest; False if all wait for an answer, which comes soon."""

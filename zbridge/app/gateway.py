@@ -60,7 +60,7 @@ LINGER_S = 0.2
 
 
 def robot_metrics(plan: GatewayPlan, metrics: Metrics) -> Metrics:
-    """Return the part of a process's metrics that a robot's gateway has: all bear its realm and name."""
+    """Return the part of a process's metrics that a robot's gateway has: all have its realm and name as labels."""
     return metrics.labelled(realm=plan.config.robot.realm, robot=plan.config.robot.name)
 
 

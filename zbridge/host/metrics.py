@@ -8,24 +8,20 @@ series of a gateway that has died, or does not answer within :data:`ANSWER_S`, a
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import socket
-from collections.abc import AsyncIterator, Iterator, Sequence
+from collections.abc import Iterator
 
-from zbridge.app.endpoint import serve_metrics
 from zbridge.app.process_usage import ProcessUsage
 from zbridge.host.runner import Runner
 from zbridge.host.runners import Runners
 from zbridge.metrics import Metrics, Reading
 from zbridge.metrics.exposition import FamilyLines, text, written
-from zbridge.protocol.address import Address
 
 ANSWER_S = 0.4
 """Longest wait for the answers of all gateways."""
 
 
 class HostMetrics:
-    """Collects the metrics of a host. runners: of the gateways. own: of the supervisor."""
+    """Collects the metrics of a host. runners: of the gateways."""
 
     def __init__(self, runners: Runners) -> None:
         self._runners = runners
@@ -37,12 +33,6 @@ class HostMetrics:
 
     def __repr__(self) -> str:
         return f"<HostMetrics of {len(self._runners.by_path)} robots>"
-
-    @contextlib.asynccontextmanager
-    async def serve(self, address: Address, adopted: Sequence[socket.socket]) -> AsyncIterator[list[socket.socket]]:
-        """Serve the metrics while the context lasts; see :func:`~zbridge.app.endpoint.serve_metrics`."""
-        async with serve_metrics(address, self.read, self.missing, adopted) as sockets:
-            yield sockets
 
     async def read(self) -> str:
         """Ask all gateways, and write what has come within :data:`ANSWER_S`."""

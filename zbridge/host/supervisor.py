@@ -19,6 +19,7 @@ from pathlib import Path
 import msgspec
 
 from zbridge.app.config import MetricsSettings
+from zbridge.app.endpoint import serve_metrics
 from zbridge.app.handover.processes import Systemd
 from zbridge.errors import ConfigError, HandoverError, NotReady
 from zbridge.host.fd_channel import Fork
@@ -104,8 +105,8 @@ class Supervisor:
         if not self._state.listen:
             return
         adopted = [socket.socket(fileno=number) for number in self._state.sockets]
-        metrics = HostMetrics(self.runners)
-        async with metrics.serve(MetricsSettings(self._state.listen).address, adopted) as self._sockets:
+        metrics, address = HostMetrics(self.runners), MetricsSettings(self._state.listen).address
+        async with serve_metrics(address, metrics.read, metrics.missing, adopted) as self._sockets:
             await asyncio.Event().wait()
 
     async def _start_forks(self) -> None:

@@ -16,7 +16,7 @@ from zbridge.camera.demand import LINGER_S
 from zbridge.camera.mjpeg import MjpegPart, MjpegReader
 from zbridge.camera.settings import CameraSettings, CameraSource, plan_camera
 from zbridge.camera.upstream import OnParts
-from zbridge.control.context import Conditions
+from zbridge.control.faults import Conditions, FaultCode
 from zbridge.errors import LinkError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import Image
@@ -215,7 +215,7 @@ async def test_the_end_of_a_camera_clears_what_it_showed(monkeypatch: pytest.Mon
         await asyncio.sleep(0.01)
         scene.end.set_result(LinkError("the stream ended"))
         await asyncio.sleep(0.01)
-        scene.conditions.set("camera relay", "camera relay 127.0.0.1:1: Address already in use")
+        scene.conditions.set(FaultCode.CAMERA_RELAY, "camera relay 127.0.0.1:1: Address already in use")
         assert len(scene.conditions.texts) == 2
     assert scene.conditions.texts == ()
     assert scene.fetching == 0

@@ -12,8 +12,9 @@ from tests.proofs import numbered
 from zbridge.client import Fleet
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
-from zbridge.control.context import Conditions, Faults, RobotContext
+from zbridge.control.context import Faults, RobotContext
 from zbridge.control.enforcer import Enforcer
+from zbridge.control.faults import Conditions
 from zbridge.control.lease_server import LeaseServer
 from zbridge.control.standstill import Standstill
 from zbridge.errors import NotReady, Refused, Unsupported

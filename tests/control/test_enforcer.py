@@ -13,9 +13,10 @@ from tests.proofs import numbered
 from zbridge.bus import Sample
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
-from zbridge.control.context import Conditions, Faults, RobotContext
+from zbridge.control.context import Faults, RobotContext
 from zbridge.control.enforcer import SUSPENDED_S, Enforcer
 from zbridge.control.events import CommandSender, StopCause
+from zbridge.control.faults import Conditions
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import Standstill
 from zbridge.errors import NeutralFirst, RateLimited

@@ -9,7 +9,7 @@ from pathlib import Path
 import msgpack
 import pytest
 
-from zbridge.control.context import Conditions
+from zbridge.control.faults import Conditions
 from zbridge.control.latch import Latches, LatchRecord
 from zbridge.control.latch_store import MOST_BYTES, LatchStore, state_folder
 from zbridge.fleet.messages import Latch

@@ -69,7 +69,7 @@ PAYLOADS: list[tuple[m.FleetMessage, dict[str, Any]]] = [
     (m.Raw(40, b"\x01"), {"id": 40, "body": b"\x01"}),
     (
         m.Status("established", links=(m.LinkStatus(**LINK),)),
-        {"state": "established", "features": [], "commands": [], "links": [LINK | none("reason")]}
+        {"state": "established", "features": [], "commands": [], "faults": [], "links": [LINK | none("reason")]}
         | none("reason protocol dialect version host"),
     ),
     (

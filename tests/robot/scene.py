@@ -35,7 +35,8 @@ from zbridge.bus import Handle, IncomingQuery, PriorityClass, Sample
 from zbridge.bus.interface import Sort
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
-from zbridge.control.context import Conditions, Faults, RobotContext
+from zbridge.control.context import Faults, RobotContext
+from zbridge.control.faults import Conditions
 from zbridge.control.latch import Latches
 from zbridge.errors import LinkError
 from zbridge.fleet import topics

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.fake_bus import FakeBus
-from zbridge.control.context import Conditions
+from zbridge.control.faults import Conditions
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Reading, Switch
 from zbridge.fleet.topics import KeySpace

@@ -13,7 +13,7 @@ from tests.fake_bus import FakeBus
 from zbridge.app.config import GatewayPlan, load
 from zbridge.app.joining import ENDED_S, RARELY_S, RETRY_S, CertificateEnded, Pauses, watch_certificate
 from zbridge.bus.tls.certificate import Certificate
-from zbridge.control.context import Conditions
+from zbridge.control.faults import Conditions
 from zbridge.errors import BusError, BusRefused, ConfigError
 from zbridge.security.certs import authority
 from zbridge.security.certs.authority import CertificateRequest

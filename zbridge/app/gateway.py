@@ -21,7 +21,7 @@ from zbridge.app.config import GatewayPlan
 from zbridge.app.endpoint import serve_metrics
 from zbridge.app.handover import ClaimPart, ColdStart, Incoming, Restarts, Successor
 from zbridge.app.joining import SessionUseless, watch_certificate, watch_session
-from zbridge.app.readings import LoopLateness, robot_readings, session_readings
+from zbridge.app.readings import LoopLateness, fault_readings, robot_readings, session_readings
 from zbridge.app.runtime import RUNTIME, Runtime, open_audit
 from zbridge.app.serving import SERVED_ELSEWHERE, Begin, Serving
 from zbridge.app.stats import GatewayStats, StatsPublisher, disks_of
@@ -29,7 +29,8 @@ from zbridge.bus import Bus, Handle, IncomingQuery
 from zbridge.bus.tls.files import own_certificate, own_name
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
-from zbridge.control.context import Conditions, Faults, RobotContext
+from zbridge.control.context import Faults, RobotContext
+from zbridge.control.faults import Conditions
 from zbridge.control.latch_store import LatchStore
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.errors import ZbridgeError, describe
@@ -109,7 +110,7 @@ class Gateway:
         """Whether the bus was closed in order; if not, one of its threads may hang."""
         self.metrics = metrics or robot_metrics(plan, Metrics())
         self.sessions = SessionTable()
-        self.conditions = Conditions()
+        self.conditions = Conditions(clock=runtime.clock, clock_ns=runtime.clock_ns)
         self._own = own_name(plan.config.bus.tls)
         """The name in our certificate."""
         self._process = "gateway"
@@ -223,6 +224,7 @@ class Gateway:
         yield from session_readings(self.sessions)
         if self._plan.device is not None:
             yield from robot_readings(self.restarts.device, self._plan.device.protocol.name)
+            yield from fault_readings(self.conditions)
 
     def missing(self) -> tuple[str, ...]:
         """Return why this gateway cannot serve its robot now: no bus, or the robot is not established."""

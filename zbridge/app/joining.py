@@ -20,7 +20,7 @@ from zbridge.app.config import GatewayPlan
 from zbridge.bus import OPEN_S, Bus, open_bus
 from zbridge.bus.tls.certificate import Certificate
 from zbridge.bus.tls.files import ends_soon, utc_now
-from zbridge.control.context import Conditions
+from zbridge.control.faults import Conditions, FaultCode
 from zbridge.errors import BusError, BusRefused
 from zbridge.fleet import topics
 from zbridge.log import Log
@@ -47,7 +47,6 @@ STUCK_S = 15.0
 """Seconds without a connection after which a second session is tried, every time; Zenoh itself tries every 4 s."""
 RECONNECTS_S = 10.0
 """Seconds within which a session connects, once another one can."""
-_CERTIFICATE = "certificate"
 
 
 class SessionUseless(BusError):
@@ -164,7 +163,7 @@ async def watch_certificate(
     bus.watch_connected(connected)
     while True:
         text = ends_soon(certificate, now())
-        conditions.set(_CERTIFICATE, text)
+        conditions.set(FaultCode.CERTIFICATE, text)
         if text is not None and (text != logged or loop.time() - logged_at >= LOG_S):
             logged, logged_at = text, loop.time()
             log.warning("certificate_ends", "{reason}", reason=text)

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any, get_args
 
+from zbridge.control.faults import Conditions, FaultCode
 from zbridge.fleet.messages import RobotState
 from zbridge.metrics import OTHER, Histogram, Metrics, Reading
 from zbridge.protocol.session import Role, Session
@@ -52,6 +53,14 @@ def robot_readings(device: RobotDevice | None, protocol: str) -> Iterator[Readin
     yield "lease_held", {}, int(authority.holders.current is not None)
     yield "robot_driven", {}, int(device.observed.driven)
     yield "latches", {}, len(authority.latches.in_force)
+
+
+def fault_readings(conditions: Conditions) -> Iterator[Reading]:
+    """Read which faults are open, and how often each has opened."""
+    opened = {fault.code for fault in conditions.faults}
+    for code in FaultCode:
+        yield "fault_open", {"code": code}, int(code in opened)
+        yield "faults", {"code": code}, conditions.counts[code]
 
 
 class LoopLateness:

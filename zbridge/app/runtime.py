@@ -20,7 +20,7 @@ from zbridge.app.process_usage import USAGE, ProcessUsage
 from zbridge.bus import Bus
 from zbridge.clocks import Clocks
 from zbridge.control.audit_log import Audit, AuditFile
-from zbridge.control.context import Conditions
+from zbridge.control.faults import Conditions, FaultCode
 from zbridge.log import Log
 from zbridge.metrics import Metrics
 from zbridge.transport.kernel import KERNEL, Kernel
@@ -61,7 +61,7 @@ def open_audit(plan: GatewayPlan, metrics: Metrics, conditions: Conditions) -> I
 
     def report(text: str | None) -> None:
         with contextlib.suppress(RuntimeError):  # the loop has ended
-            loop.call_soon_threadsafe(conditions.set, "audit", text)
+            loop.call_soon_threadsafe(conditions.set, FaultCode.AUDIT_LOG, text)
 
     file = AuditFile(
         Path(control.audit),

@@ -18,7 +18,7 @@ from zbridge.camera.pace import Pace
 from zbridge.camera.relay import Latest, Relay
 from zbridge.camera.settings import CameraPlan
 from zbridge.camera.upstream import fetch
-from zbridge.control.context import Conditions
+from zbridge.control.faults import Conditions, FaultCode
 from zbridge.errors import LinkError, ProtocolError, describe
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -35,7 +35,6 @@ STEADY_S = 10.0
 """A stream that lasted this long was good: the next attempt follows soon; seconds."""
 RETRY_S = 5.0
 """Longest time between two attempts, without jitter: less than the relay's clients wait for a picture."""
-_CONDITION, _RELAY = "camera", "camera relay"
 
 
 class Camera:
@@ -62,7 +61,9 @@ class Camera:
         """The newest picture."""
         self._relay: Relay | None = None
         if plan.relay is not None:
-            self._relay = Relay(plan, plan.relay, demand, latest, metrics, lambda text: conditions.set(_RELAY, text))
+            self._relay = Relay(
+                plan, plan.relay, demand, latest, metrics, lambda text: conditions.set(FaultCode.CAMERA_RELAY, text)
+            )
         self._publisher = bus.publisher(self._key, topics.IMAGE)
         self._pace: Pace[tuple[MjpegPart, int]] = Pace(plan.settings.rate_hz)
         self._timer: asyncio.TimerHandle | None = None
@@ -86,15 +87,15 @@ class Camera:
             self._reset()
             watch.close()
             self._publisher.close()
-            for name in (_CONDITION, _RELAY):
-                self._conditions.set(name, None)
+            for code in (FaultCode.CAMERA, FaultCode.CAMERA_RELAY):
+                self._conditions.set(code, None)
 
     async def _follow(self) -> None:
         """Fetch the stream whenever somebody watches."""
         backoff = Backoff(most_s=RETRY_S)
         while True:
             if not self.demand.wanted:
-                self._conditions.set(_CONDITION, None)
+                self._conditions.set(FaultCode.CAMERA, None)
             await self.demand.begin()
             begun = self._loop.time()
             reason = await self._fetch()
@@ -108,7 +109,7 @@ class Camera:
             delay_s = backoff.delay_s()
             template = "camera {source}: {reason}; next attempt in {delay_s:.1f} s"
             log.info("camera_lost", template, source=self._plan.source, reason=reason, delay_s=delay_s)
-            self._conditions.set(_CONDITION, f"camera {self._plan.source}: {reason}")
+            self._conditions.set(FaultCode.CAMERA, f"camera {self._plan.source}: {reason}")
             await asyncio.sleep(delay_s)
 
     async def _fetch(self) -> str | None:
@@ -132,7 +133,7 @@ class Camera:
         if not parts:
             return
         self._pictures.value += len(parts)
-        self._conditions.set(_CONDITION, None)
+        self._conditions.set(FaultCode.CAMERA, None)
         for part in parts:
             self.latest.show(stream, part)
         if self.demand.listened:

@@ -1,4 +1,4 @@
-"""What the parts that serve one robot share: the bus, counters, clocks, lasting conditions, faults of its protocol."""
+"""What the parts that serve one robot share: the bus, counters, clocks, open faults, faults of its protocol."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import msgspec
 
 from zbridge.bus import Bus
 from zbridge.clocks import raw_ms, suspended_s
+from zbridge.control.faults import Conditions
 from zbridge.errors import FAULT, Unsupported, describe
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import KeySpace, Topic
@@ -20,36 +21,6 @@ log = Log("zbridge.robot.commands")
 
 LOGGED = 16
 """Faults that are logged, each once."""
-
-
-class Conditions:
-    """Lasting faults of a robot that is served all the same, or of its gateway; ``status.reason`` shows them.
-
-    Each part that finds a fault sets a condition under a name of its own and clears it when the fault has passed.
-    ``changed`` is called when a condition is set, changed or cleared.
-    """
-
-    def __init__(self, changed: Callable[[], object] = lambda: None) -> None:
-        self.changed = changed
-        self._texts: dict[str, str] = {}
-
-    def __repr__(self) -> str:
-        return f"<Conditions {sorted(self._texts)}>"
-
-    @property
-    def texts(self) -> tuple[str, ...]:
-        """The texts for people, oldest first."""
-        return tuple(self._texts.values())
-
-    def set(self, name: str, text: str | None) -> None:
-        """Set the condition of a name; None clears it."""
-        if self._texts.get(name) == text:
-            return
-        if text is None:
-            del self._texts[name]
-        else:
-            self._texts[name] = text
-        self.changed()
 
 
 class Faults:

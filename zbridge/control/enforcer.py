@@ -23,6 +23,7 @@ from zbridge.control.authority import Authority
 from zbridge.control.context import RobotContext
 from zbridge.control.event_counts import EventCounts
 from zbridge.control.events import CommandSender, EventKind, StopCause
+from zbridge.control.faults import EventFaults
 from zbridge.control.latch import Latches, LatchRecord, read_stop
 from zbridge.control.lease_hook import LeaseHook
 from zbridge.control.motion_limits import MotionLimits
@@ -84,6 +85,8 @@ class Enforcer:
         self._control_due: asyncio.TimerHandle | None = None
         self._closed = False
         self._counts = EventCounts(context.metrics)
+        self._faults = EventFaults(context.conditions, context.clock)
+        self._faults.latched(authority.latches.in_force, anew=False)
         self._same_stops = context.metrics.count("stops_folded")
         self._slowed = context.metrics.count("drives_slowed")
         self._remind()
@@ -122,6 +125,7 @@ class Enforcer:
         authority = self.authority
         if moving:
             authority.motion.check_motion()
+            self._faults.moved()
         whole = isinstance(command, Drive)
         authority.applied(path, sender.given_at, moving=moving, stale=sender.stale, whole=whole)
         if isinstance(command, Drive):
@@ -174,6 +178,7 @@ class Enforcer:
     def restore(self, latches: Latches) -> None:
         """Take over what was written down, before the robot is served; raise ProtocolError."""
         self.authority.restore_latches(latches.export())
+        self._faults.latched(self.authority.latches.in_force, anew=False)
         self._remind()
 
     def write_autonomous(self) -> asyncio.Future[None] | None:
@@ -242,6 +247,7 @@ class Enforcer:
         while events := self.authority.events():
             for event in events:
                 self._counts.note(event)
+                self._faults.note(event)
                 if event.what is not EventKind.REFUSED:
                     changed = True
                     if event.what is not EventKind.ACQUIRED and self._limits is not None:
@@ -249,6 +255,7 @@ class Enforcer:
                 if event.stops:
                     self._send_stop()
                 if event.what in (EventKind.LATCHED, EventKind.UNLATCHED):
+                    self._faults.latched(self.authority.latches.in_force)
                     self._save_latches()
                 self._audit.write(event)
             self.lease_hook.notify()

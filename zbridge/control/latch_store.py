@@ -19,7 +19,7 @@ from pathlib import Path
 
 import msgspec
 
-from zbridge.control.context import Conditions
+from zbridge.control.faults import Conditions, FaultCode
 from zbridge.control.latch import Latches, LatchRecord
 from zbridge.fleet.messages import Latch
 from zbridge.fleet.topics import KeySpace
@@ -31,7 +31,6 @@ MOST_BYTES = 64 * 1024
 """A larger file was not written by a gateway."""
 FLUSH_S = 1.0
 """Longest wait for a disk."""
-_CONDITION = "latch file"
 _OWN, _STANDBY = "latches", "standby.latches"
 _encode = msgspec.msgpack.Encoder().encode
 _decode = msgspec.msgpack.Decoder(LatchRecord).decode
@@ -135,7 +134,7 @@ class LatchStore:
                 except OSError as error:
                     self._fail(path, error)
                 else:
-                    self._conditions.set(_CONDITION, None)
+                    self._conditions.set(FaultCode.LATCH_FILE, None)
         finally:
             self._writing = None
 
@@ -144,7 +143,7 @@ class LatchStore:
         text = f"latched stops do not survive a restart: {path}: {error.strerror or error}"
         if text not in self._conditions.texts:
             log.error("latch_not_written", "{reason}", reason=text, file=path)
-        self._conditions.set(_CONDITION, text)
+        self._conditions.set(FaultCode.LATCH_FILE, text)
 
 
 def _write(path: Path, data: bytes) -> None:

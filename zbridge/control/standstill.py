@@ -10,6 +10,7 @@ import math
 
 from zbridge.control.authority import Authority
 from zbridge.control.context import RobotContext
+from zbridge.control.faults import FaultCode
 from zbridge.control.settings import LEAST_IDLE_STOP_S
 from zbridge.errors import Refused
 from zbridge.protocol.session import State
@@ -18,7 +19,6 @@ STOP_REPEAT_S = 1.0
 """Seconds for which a stop is repeated quickly."""
 IDLE_STOP_S = 1.0
 """Seconds between two stops after that, unless the configuration says otherwise."""
-_CONDITION = "stop"
 
 
 class Standstill:
@@ -78,9 +78,9 @@ class Standstill:
         try:
             self._write(now, until)
         except Refused as refusal:
-            self._context.conditions.set(_CONDITION, f"cannot be stopped: {refusal}")
+            self._context.conditions.set(FaultCode.CANNOT_STOP, f"cannot be stopped: {refusal}")
             raise
-        self._context.conditions.set(_CONDITION, None)
+        self._context.conditions.set(FaultCode.CANNOT_STOP, None)
         self._context.pump()
 
     def _write(self, now: float, until: float) -> None:
@@ -95,7 +95,7 @@ class Standstill:
         self.begin()
         session, now = self._context.robot.driving, self._clock()
         if session is None or session.state is not State.ESTABLISHED:
-            self._context.conditions.set(_CONDITION, None)
+            self._context.conditions.set(FaultCode.CANNOT_STOP, None)
         elif (
             (self._idle_stop_s or self._authority.latches)
             and not self._authority.motion.driven

@@ -210,6 +210,19 @@ class LinkStatus(msgspec.Struct, frozen=True):
     shared: bool | UnsetType = UNSET
 
 
+class Fault(msgspec.Struct, frozen=True):
+    """An open fault of a robot or of its gateway.
+
+    code: what is wrong, for programs. text: for people. since_ns: when it opened, Unix time. count: how often it
+    occurred since then.
+    """
+
+    code: str
+    text: str
+    since_ns: int
+    count: int = 1
+
+
 RobotState = Literal["offline", "connecting", "handshaking", "established", "closing"]
 
 
@@ -219,7 +232,8 @@ class Status(FleetMessage, frozen=True):
     state: of the robot. reason: why it is not established, or what is wrong with it. protocol, dialect, version: of the
     robot. features: features that both sides use. links: links to the robot. host: the machine of its gateway. stalled:
     True while the robot's link acknowledges nothing: what it is sent waits. commands: what the robot accepts now:
-    ``stop``, ``drive``, ``light``, ``motor``; whoever holds the robot or not.
+    ``stop``, ``drive``, ``light``, ``motor``; whoever holds the robot or not. faults: what is wrong, oldest first; an
+    event such as a deadman is shown for a minute.
     """
 
     state: RobotState
@@ -232,6 +246,7 @@ class Status(FleetMessage, frozen=True):
     host: str | None = None
     stalled: bool | UnsetType = UNSET
     commands: tuple[str, ...] = ()
+    faults: tuple[Fault, ...] = ()
 
 
 class Refusal(msgspec.Struct, frozen=True, kw_only=True):

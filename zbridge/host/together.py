@@ -24,7 +24,7 @@ from zbridge.app.process_usage import USAGE
 from zbridge.app.readings import LoopLateness
 from zbridge.bus import Bus
 from zbridge.bus.tls.files import own_certificate
-from zbridge.control.context import Conditions
+from zbridge.control.faults import Conditions
 from zbridge.errors import ZbridgeError
 from zbridge.host.addresses import hold_addresses
 from zbridge.host.settings import HostSettings

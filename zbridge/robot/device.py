@@ -206,6 +206,7 @@ class RobotDevice(Transferable):
         while True:
             await asyncio.sleep(HEARTBEAT_S)
             self._publishers.expire()
+            self._context.conditions.expire()
             if self._commanded:  # else another gateway, or the next process, says it
                 self._presence.publish_status()
                 self.enforcer.beat()

@@ -12,6 +12,7 @@ from msgspec import UNSET
 from zbridge.control.context import RobotContext
 from zbridge.control.enforcer import Enforcer
 from zbridge.control.events import StopCause
+from zbridge.control.faults import FaultCode
 from zbridge.control.standstill import Standstill
 from zbridge.errors import Refused
 from zbridge.fleet import topics
@@ -100,7 +101,7 @@ class Presence:
         if name != self._links.first.name:
             return
         self._commands.blocked = stalled
-        self._context.conditions.set("link", f"{LINK_BLOCKED}: it is not driven" if stalled else None)
+        self._context.conditions.set(FaultCode.LINK_STALLED, f"{LINK_BLOCKED}: it is not driven" if stalled else None)
         if stalled:
             self._stalls.value += 1
             log.warning("link_stalled", "{robot}: {reason}", robot=self._context.keys.robot, reason=LINK_BLOCKED)
@@ -133,21 +134,24 @@ class Presence:
                 host=self._host,
                 stalled=self._commands.blocked or UNSET,
                 commands=("stop", *context.robot.accepts) if agreed is not None and agreed.busy is None else (),
+                faults=context.conditions.faults,
             ),
         )
 
     def _on_lost(self, session: Session[Any]) -> None:
         self._commands.blocked = False
-        self._context.conditions.set("link", None)
+        self._context.conditions.set(FaultCode.LINK_STALLED, None)
         if session.version is not None:
             self._lost.value += len(session.outbox)
             if not self._leaving:
+                self._context.conditions.set(FaultCode.ROBOT_LOST, session.reason or "ended", quiet=True)
                 self._enforcer.require_neutral("robot lost", StopCause.ROBOT_LOST, stops=False)
             self._pending.refuse_all("the robot was lost")
 
     def _on_established(self, session: Session[Any]) -> None:
         """Stop the robot, which something else may have driven before, and publish what it can show at once."""
         self._greeted = session
+        self._context.conditions.set(FaultCode.ROBOT_LOST, None, quiet=True)
         with contextlib.suppress(Refused):  # the condition says so on status
             self._standstill.stop()
         self._enforcer.lease_hook.notify(anew=True)

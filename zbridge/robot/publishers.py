@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 from zbridge.bus import Bus, Publisher
-from zbridge.control.context import Conditions
+from zbridge.control.faults import Conditions, FaultCode
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import KeySpace, Topic, find
@@ -127,7 +127,7 @@ class RobotPublishers:
 
     def _show_names(self) -> None:
         text = f"more than {NAMES} different names within an hour: the others are not published"
-        self._conditions.set("names", text if self._names.over else None)
+        self._conditions.set(FaultCode.TOO_MANY_NAMES, text if self._names.over else None)
 
 
 def _is_named(path: str) -> bool:

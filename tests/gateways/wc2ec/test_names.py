@@ -15,7 +15,8 @@ from tests.gateways.wc2ec.golden import DISTANCE, data, registration
 from zbridge.bus import Publisher
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
-from zbridge.control.context import Conditions, Faults, RobotContext
+from zbridge.control.context import Faults, RobotContext
+from zbridge.control.faults import Conditions
 from zbridge.fleet.topics import KeySpace, Topic
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address

@@ -30,6 +30,11 @@ _KEY_PARTS = 1000
 _BETWEEN_KEYS = re.compile(rb"[,=\[\]{}#\r\n]")
 _PATH = re.compile(r" - at `\$(?:\.(?P<path>[^`]+)|(?P<index>\[[^`]+))?`$")
 
+_SECRET = re.compile(r"pass|secret|token|key|credential|private|auth", re.IGNORECASE)
+_IN_ADDRESS = re.compile(r"(?<=//)[^/@\s]*@")
+_IN_QUERY = re.compile(rf"(?<=[?&;])([^=&#\s]*(?:{_SECRET.pattern})[^=&#\s]*=)[^&;#\s]*", re.IGNORECASE)
+HIDDEN = "***"
+
 
 def read_file(path: Path, most_bytes: int = FILE_BYTES, *, waits: bool = False) -> bytes:
     """Read a regular file of ``most_bytes`` at most; raise ConfigError, which names the file.
@@ -166,3 +171,16 @@ def _plain_type(at: inspect.Type) -> inspect.Type:
         types = [member for member in at.types if not isinstance(member, inspect.NoneType)]
         return types[0] if len(types) == 1 else at
     return at
+
+
+def without_secrets(value: Any, name: str = "") -> Any:
+    """Return a configuration without what may be secret: values of telling names, the ``tls`` table, logins."""
+    if name == "tls" or (_SECRET.search(name) and not isinstance(value, dict)):
+        return HIDDEN
+    if isinstance(value, dict):
+        return {str(key): without_secrets(item, str(key)) for key, item in value.items()}
+    if isinstance(value, list):
+        return [without_secrets(item) for item in value]
+    if isinstance(value, str):
+        return _IN_QUERY.sub(rf"\g<1>{HIDDEN}", _IN_ADDRESS.sub(f"{HIDDEN}@", value))
+    return value

@@ -128,7 +128,7 @@ class PlayedLauncher:
         self.refuses: list[NotReady] = []
         self._make, self._stream = make, stream
 
-    async def start(self, file: RobotFile, take_over: int | None = None, *, at_once: bool = False) -> GatewayProcess:
+    async def start(self, file: RobotFile, take_over: int | None = None, **how: object) -> GatewayProcess:
         if self.refuses:
             raise self.refuses.pop()
         self.children.append(child := Child(file, self._stream, take_over))

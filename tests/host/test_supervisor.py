@@ -43,7 +43,8 @@ class Process:
     def reap(self) -> None:
         """It is alive."""
 
-    def kill(self, why: str) -> None:
+    def kill(self, why: str, *, hung: bool) -> None:
+        assert hung
         self.killed.append(why)
 
 

@@ -182,7 +182,7 @@ async def test_a_large_published_value_is_left_out_of_a_deposit_and_its_key_stay
     budget = Budget(size - 1)
     async with heir_of(deposited(rig, budget)) as heir:
         assert budget.left_out["status"] == size
-        assert "status" in heir.device._publishers.known
+        assert "status" in heir.device.publishers.known
     assert deposited(rig, Budget(size))["published"][0][1] is not None
 
 

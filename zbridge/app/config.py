@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 import msgspec
 
+from zbridge.blackbox.settings import BlackBoxSettings
 from zbridge.bus import BusSettings
 from zbridge.bus.tls.files import TLS_VARIABLE, folder_settings, tls_beside
 from zbridge.camera.settings import CameraPlan, CameraSettings, plan_camera
@@ -27,7 +28,7 @@ from zbridge.protocol.address import Address
 from zbridge.protocol.networks import parse_networks
 from zbridge.protocol.plugin import find_protocol
 from zbridge.robot.settings import DevicePlan, DeviceSettings
-from zbridge.toml import convert, parse_toml, prefixed, read_file
+from zbridge.toml import convert, parse_toml, prefixed, read_file, without_secrets
 from zbridge.transport import server_context
 
 _VARIABLE = re.compile(r"\$\{(\w+)\}")
@@ -82,16 +83,21 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     metrics: MetricsSettings | None = None
     log: LogSettings = LogSettings()
     camera: CameraSettings | None = None
+    blackbox: BlackBoxSettings | None = None
 
 
 class GatewayPlan(msgspec.Struct, frozen=True):
-    """A configuration with the protocols, options and addresses that it names: what a gateway starts from."""
+    """A configuration with the protocols, options and addresses that it names: what a gateway starts from.
+
+    written: the configuration as it was written, without secrets: ``${VAR}`` is not replaced.
+    """
 
     config: Config
     device: DevicePlan | None
     listeners: tuple[ListenerPlan, ...] = ()
     metrics: Address | None = None
     camera: CameraPlan | None = None
+    written: dict[str, Any] = {}
 
     @property
     def described(self) -> str:
@@ -152,6 +158,7 @@ def _secured(bus: BusSettings, beside: Path, tls: Path | None, variable: str | N
 
 def plan(raw: dict[str, Any], environment: Mapping[str, str] = os.environ) -> GatewayPlan:
     """Check a configuration given as a dict; raise ConfigError."""
+    written = without_secrets(raw)
     raw = _substituted(raw, environment, "")
     config = convert(raw, Config, "")
     for key, name in (("robot.name", config.robot.name), ("robot.realm", config.robot.realm)):
@@ -173,7 +180,9 @@ def plan(raw: dict[str, Any], environment: Mapping[str, str] = os.environ) -> Ga
     camera = plan_camera(config.camera) if config.camera is not None else None
     if camera is not None and device is None:
         raise ConfigError("camera: expected only with a table device")
-    return GatewayPlan(config, device, listeners, metrics, camera)
+    if config.blackbox is not None and device is None:
+        raise ConfigError("blackbox: expected only with a table device")
+    return GatewayPlan(config, device, listeners, metrics, camera, written)
 
 
 def _device(settings: DeviceSettings) -> DevicePlan:

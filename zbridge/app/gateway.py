@@ -17,6 +17,7 @@ from typing import Any
 
 import msgspec
 
+from zbridge.app.black_box import BoxServer, open_black_box
 from zbridge.app.config import GatewayPlan
 from zbridge.app.endpoint import serve_metrics
 from zbridge.app.handover import ClaimPart, ColdStart, Incoming, Restarts, Successor
@@ -25,12 +26,13 @@ from zbridge.app.readings import LoopLateness, fault_readings, robot_readings, s
 from zbridge.app.runtime import RUNTIME, Runtime, open_audit
 from zbridge.app.serving import SERVED_ELSEWHERE, Begin, Serving
 from zbridge.app.stats import GatewayStats, StatsPublisher, disks_of
+from zbridge.blackbox import BlackBox
 from zbridge.bus import Bus, Handle, IncomingQuery
 from zbridge.bus.tls.files import own_certificate, own_name
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
 from zbridge.control.context import Faults, RobotContext
-from zbridge.control.faults import Conditions
+from zbridge.control.faults import Conditions, FaultCode
 from zbridge.control.latch_store import LatchStore
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.errors import ZbridgeError, describe
@@ -50,6 +52,7 @@ from zbridge.robot.device import ControlParts, RobotDevice
 from zbridge.robot.observer import Observer
 from zbridge.robot.ownership import Ownership
 from zbridge.robot.settings import DevicePlan
+from zbridge.robot.wire_tap import recording
 from zbridge.tasks import together, until
 from zbridge.transport import Parcel, attach, connect
 from zbridge.transport.reading import FairShare
@@ -80,7 +83,8 @@ class Gateway:
 
     metrics, sessions, conditions: of this gateway, shared by all parts. observer: a supervisor, notified of the robot's
     links. predecessor: the channel to the gateway that hands over to this one. successor: starts the process that this
-    one hands over to. runtime: clocks, processes and sockets of the machine.
+    one hands over to. runtime: clocks, processes and sockets of the machine. died: how the process before this one
+    ended, if it did not end in order.
     """
 
     def __init__(
@@ -92,8 +96,11 @@ class Gateway:
         predecessor: socket.socket | None = None,
         successor: Successor | None = None,
         runtime: Runtime = RUNTIME,
+        died: tuple[FaultCode, str] | None = None,
     ) -> None:
         self._plan = plan
+        self._died = died
+        self._box: BlackBox | None = None
         self._runtime = runtime
         self._observer = observer
         self._keys = KeySpace(plan.config.robot.realm, plan.config.robot.name)
@@ -128,7 +135,7 @@ class Gateway:
 
         Returns if everything was handed to a successor. Raises HandoverError if the predecessor hands over nothing.
         """
-        with open_audit(self._plan, self.metrics, self.conditions) as audit:
+        with self._open_files(alone=True) as audit:
             while True:
                 bus = await self._runtime.join(self._plan, self.metrics)
                 try:
@@ -152,8 +159,18 @@ class Gateway:
         neighbourhood: None if the process serves this robot only.
         """
         self._neighbourhood = neighbourhood
-        with open_audit(self._plan, self.metrics, self.conditions) as audit:
+        with self._open_files(alone=neighbourhood is None) as audit:
             await self._run(bus, audit, alone=False)
+
+    @contextlib.contextmanager
+    def _open_files(self, *, alone: bool) -> Iterator[Audit]:
+        """Open what the gateway writes: the audit log, and the black box. alone: the process serves this robot only."""
+        gone, folder = self.restarts.gone.is_set, self._runtime.folder
+        with (
+            open_audit(self._plan, self.metrics, self.conditions) as audit,
+            open_black_box(self._plan, self._keys, self.conditions, folder, gone, alone) as self._box,
+        ):
+            yield audit
 
     async def _run(self, bus: Bus, audit: Audit, *, alone: bool = True) -> None:
         """Run all parts. alone: the bus and the metrics are this gateway's own."""
@@ -225,6 +242,7 @@ class Gateway:
         if self._plan.device is not None:
             yield from robot_readings(self.restarts.device, self._plan.device.protocol.name)
             yield from fault_readings(self.conditions)
+            yield from self._box.readings() if self._box is not None else ()
 
     def missing(self) -> tuple[str, ...]:
         """Return why this gateway cannot serve its robot now: no bus, or the robot is not established."""
@@ -277,19 +295,23 @@ class Gateway:
         """Answer queries for the session table of this process; ``who`` names the process."""
 
         def answer(question: IncomingQuery) -> None:
-            table = Sessions(self.sessions.snapshots(), stamp_ns=self._runtime.clock_ns())
-            if who != "gateway":
-                process, listeners = self._stats.process(), self._stats.listeners()
-                table = msgspec.structs.replace(table, process=process, listeners=listeners)
-            question.answer(payloads.encode(table))
+            question.answer(self._session_table(of_listeners=who != "gateway"))
 
         return bus.answer(self._keys.key(topics.RPC_SESSIONS(who).path), answer)
+
+    def _session_table(self, *, of_listeners: bool = False) -> bytes:
+        table = Sessions(self.sessions.snapshots(), stamp_ns=self._runtime.clock_ns())
+        if of_listeners:
+            process, listeners = self._stats.process(), self._stats.listeners()
+            table = msgspec.structs.replace(table, process=process, listeners=listeners)
+        return payloads.encode(table)
 
     async def _serve(
         self, bus: Bus, ownership: Ownership, device: RobotDevice, store: LatchStore, begin: Begin | None = None
     ) -> None:
         """Serve the robot, and its camera, until another gateway takes it over."""
         self.restarts.device, camera = device, None
+        self._begin_recording(device)
         if self._plan.camera is not None:
             from zbridge.camera.camera import Camera
 
@@ -297,7 +319,8 @@ class Gateway:
 
         def show() -> tuple[Handle, ...]:
             stats = StatsPublisher(bus, self._keys, self._stats)
-            return (self._show_sessions(bus, "gateway"), self.restarts.answer(bus), stats)
+            box = () if self._box is None else (BoxServer(bus, self._keys, self._box, self._runtime.clock),)
+            return (self._show_sessions(bus, "gateway"), self.restarts.answer(bus), stats, *box)
 
         self._serving = Serving(
             self._keys.robot, device, ownership, store, self.conditions, show, camera, self._runtime.clock
@@ -306,6 +329,18 @@ class Gateway:
             await self._serving.run(begin)
         finally:
             self.restarts.device = self._serving = None
+            if self._box is not None:
+                self._box.snapshot = tuple
+
+    def _begin_recording(self, device: RobotDevice) -> None:
+        """Begin the black box, and note how the process before this one ended."""
+        if self._box is not None:
+            sessions = self._keys.key(topics.RPC_SESSIONS("gateway").path)
+            self._box.snapshot = lambda: [*device.publishers.states(), (sessions, self._session_table())]
+            self._box.begin()
+        died, self._died = self._died, None
+        if died is not None:
+            self.conditions.happened(*died)
 
     def _authority(self, store: LatchStore) -> Authority:
         control, bus = self._plan.config.control, self._plan.config.bus
@@ -335,6 +370,7 @@ class Gateway:
                 clock_ns=runtime.clock_ns,
                 raw_ms=runtime.raw_ms,
                 suspended_s=runtime.suspended_s,
+                box=self._box,
             ),
             plan.protocol.name,
             LinkSettings(
@@ -345,6 +381,7 @@ class Gateway:
                 chance=runtime.chance,
                 share=FairShare(near.part) if near is not None else None,
                 shared=plan.shares,
+                tap=partial(recording, self._box, self._keys),
             ),
             ControlParts(
                 authority=self._authority(store),

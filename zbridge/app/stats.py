@@ -12,6 +12,7 @@ from pathlib import Path
 
 import msgspec
 
+from zbridge.app.black_box import box_folder
 from zbridge.app.config import GatewayPlan
 from zbridge.app.process_usage import Disks, ProcessUsage
 from zbridge.bus import Bus
@@ -124,5 +125,9 @@ def disks_of(plan: GatewayPlan, folder: Path | None) -> Disks:
     if plan.device is None:
         return ()
     audit = plan.config.control.audit
-    kept = ("latches", folder if folder is not None else state_folder())
-    return (kept, ("audit", Path(audit).absolute())) if audit is not None else (kept,)
+    disks: list[tuple[str, Path]] = [("latches", folder if folder is not None else state_folder())]
+    if audit is not None:
+        disks.append(("audit", Path(audit).absolute()))
+    if (blackbox := plan.config.blackbox) is not None:
+        disks.append(("blackbox", box_folder(blackbox, folder).absolute()))
+    return tuple(disks)

@@ -34,7 +34,7 @@ from zbridge.cli.logs import last_words
 from zbridge.cli.logs import set_up_log as set_up_log
 from zbridge.errors import ConfigError, ZbridgeError, describe
 from zbridge.host.addresses import hold_addresses
-from zbridge.host.settings import HostFile, require_different_robots, require_one_bus
+from zbridge.host.settings import HostFile, require_different_robots, require_one_bus, with_host
 from zbridge.host.together import Together
 from zbridge.log import Log
 from zbridge.metrics.exposition import written
@@ -42,7 +42,8 @@ from zbridge.security.member import check_member
 from zbridge.toml import prefixed, read_file
 
 if TYPE_CHECKING:  # loaded only under a supervisor
-    from zbridge.app.config import GatewayPlan, LogSettings
+    from zbridge.app.config import GatewayPlan
+    from zbridge.control.faults import FaultCode
     from zbridge.host.child import Reporter
 
 log = Log("zbridge.cli")
@@ -122,18 +123,21 @@ def run_gateway(
     take_over: int | None = None,
     reporter: Reporter | None = None,
     content: bytes | None = None,
-    host_log: LogSettings | None = None,
+    host: HostFile = HostFile(),  # noqa: B008 - frozen
+    died: tuple[FaultCode, str] | None = None,
 ) -> None:
     """Run the gateway of a configuration until SIGTERM or SIGINT, or until a successor has taken it over.
 
     content: of the file, if it was read already. tls: a folder, for a file without ``bus.tls``. take_over: the
     descriptor of the channel to the gateway that hands over to this process. reporter: reports to the supervisor, if
-    there is one, which then also starts successors. host_log: for a file that says nothing of it.
+    there is one, which then also starts successors. host: for a file that says nothing of log or black
+    box. died: how the process before this one died.
     """
     if reporter is None:
         set_up_log(verbose=verbose)
     plan = load(file, tls=tls, content=content)
-    settings, robot = plan.config.log.over(host_log), plan.config.robot.name
+    plan = with_host(plan, host)
+    settings, robot = plan.config.log.over(host.log), plan.config.robot.name
     set_up_log(verbose=verbose, robot=robot, labelled=reporter is not None, settings=settings)
     hand_on_tls(tls)
     with prefixed(f"{file}: "):
@@ -141,7 +145,7 @@ def run_gateway(
     gc.freeze()  # objects made at start-up live as long as the process: exclude them from garbage collection
     predecessor = socket.socket(fileno=take_over) if take_over is not None else None
     successor = reporter if reporter is not None else Spawn(file, verbose=verbose)
-    gateway = Gateway(plan, observer=reporter, predecessor=predecessor, successor=successor)
+    gateway = Gateway(plan, observer=reporter, predecessor=predecessor, successor=successor, died=died)
 
     async def serve() -> None:
         async with hold_addresses(plan):
@@ -191,7 +195,7 @@ def run_together(files: Sequence[Path], host: HostFile, *, verbose: bool = False
     plans, faults = [], []
     for file in files:
         try:
-            plans.append((file, load(file, content=read_file(file, host.host.file_bytes))))
+            plans.append((file, with_host(load(file, content=read_file(file, host.host.file_bytes)), host)))
         except ConfigError as error:
             faults.append(error)
             log.error("file_not_run", "{reason}", reason=error, file=file)

@@ -8,10 +8,12 @@ from pathlib import Path
 
 from zbridge.cli import give_up, run_gateway, set_up_log
 from zbridge.cli.logs import log_settings
+from zbridge.control.faults import FaultCode
 from zbridge.errors import ConfigError, ZbridgeError
 from zbridge.host.child import Reporter
-from zbridge.host.fd_channel import FdChannel
+from zbridge.host.fd_channel import FdChannel, Fork
 from zbridge.host.fork_server import Birth, serve
+from zbridge.host.settings import HostFile
 
 
 def main() -> None:
@@ -31,7 +33,8 @@ def run(birth: Birth) -> int:
             verbose=request.verbose,
             take_over=birth.take_over if birth.take_over >= 0 else None,
             reporter=Reporter(FdChannel.inherited(birth.channel), hands_over=True),
-            host_log=settings,
+            host=HostFile(log=settings, blackbox=request.blackbox),
+            died=_death(request),
         )
     except ZbridgeError as error:
         try:
@@ -41,6 +44,12 @@ def run(birth: Birth) -> int:
     finally:
         logging.shutdown()  # the process ends without Python's own end
     return 0
+
+
+def _death(request: Fork) -> tuple[FaultCode, str] | None:
+    """Return how the process before this one died; None: it ended in order, or there was none."""
+    code = FaultCode.GATEWAY_HUNG if request.hung else FaultCode.GATEWAY_DIED
+    return (code, request.died) if request.died else None
 
 
 if __name__ == "__main__":

@@ -52,7 +52,12 @@ def _with_host_file(state: SupervisorState) -> SupervisorState:
             os.close(descriptor)
         state = structs.replace(state, sockets=())
     return structs.replace(
-        state, host=found.host, log_format=found.log.format or "", log_level=found.log.level or "", listen=listen
+        state,
+        host=found.host,
+        log_format=found.log.format or "",
+        log_level=found.log.level or "",
+        listen=listen,
+        blackbox=found.blackbox,
     )
 
 

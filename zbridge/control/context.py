@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import msgspec
 
+from zbridge.blackbox import BlackBox
 from zbridge.bus import Bus
 from zbridge.clocks import raw_ms, suspended_s
 from zbridge.control.faults import Conditions
@@ -54,7 +55,7 @@ class RobotContext(msgspec.Struct, frozen=True):
 
     publish: shows a message on the bus. pump: writes to the robot what its sessions have to write.
     clock: seconds on the event loop's time line, from any thread. clock_ns: Unix time in nanoseconds, for stamps.
-    raw_ms, suspended_s: see :mod:`zbridge.clocks`.
+    raw_ms, suspended_s: see :mod:`zbridge.clocks`. box: records what passes; None: nothing does.
     """
 
     robot: RobotSide
@@ -69,3 +70,4 @@ class RobotContext(msgspec.Struct, frozen=True):
     suspended_s: Callable[[], float] = suspended_s
     publish: Callable[[Topic, FleetMessage], object] = lambda topic, message: None
     pump: Callable[[], object] = lambda: None
+    box: BlackBox | None = None

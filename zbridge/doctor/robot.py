@@ -261,6 +261,7 @@ _REMEDIES = {
 }
 _DISK = {
     "audit": "make room: events are lost until then, robots are served all the same",
+    "blackbox": "make room, or set another dir in [blackbox]: incidents are lost until then",
     "latches": "make room: a latched stop, or mode autonomous, cannot be kept through a restart",
 }
 REMEDIES: dict[str, str] = {

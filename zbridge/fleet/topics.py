@@ -13,6 +13,7 @@ from urllib.parse import unquote
 
 import msgspec
 
+from zbridge.fleet.incidents import ReadIncident
 from zbridge.fleet.lease_messages import Acquire, Authorization, Unlatch
 from zbridge.fleet.messages import (
     Battery,
@@ -260,6 +261,13 @@ RPC_REFUSED = _family("@rpc/control/refused", Refusals, Delivery.QUERY, SETTING_
 """A listener reports what it refused its HQ programs, at ``hq.<listener>``."""
 RPC_RESTART = _family("@rpc/restart", Query, Delivery.QUERY, QUERY_BYTES)
 """The gateway hands everything over to a new process; replies once that is done, or refused with the reason."""
+
+RPC_INCIDENTS = Topic("@rpc/blackbox/incidents", Query, Delivery.QUERY, SMALL_BYTES)
+"""The incidents that the black box of this gateway keeps."""
+RPC_INCIDENT_READ = _family("@rpc/blackbox/read", ReadIncident, Delivery.QUERY, QUERY_BYTES)
+"""A part of an incident's file, by the name of the one who asks."""
+RPC_INCIDENT_KEEP = _family("@rpc/blackbox/keep", Text, Delivery.QUERY, SETTING_BYTES)
+"""Keeps the minutes before now, by the name of the one who asks; the text says why."""
 
 _TOPICS = {topic.path: topic for topic in list(globals().values()) if isinstance(topic, Topic)}
 

@@ -15,6 +15,7 @@ from collections.abc import Iterator, Sequence
 
 import msgspec
 
+from zbridge.blackbox import BlackBoxSettings
 from zbridge.robot.observer import Boundary, LastStop
 
 MESSAGE_BYTES = 64 * 1024
@@ -109,7 +110,9 @@ class Fork(msgspec.Struct, frozen=True, tag="fork"):
     """Fork a gateway.
 
     Descriptors come along: its end of the channel, the content of its file, and the socket from which it takes over, if
-    it does. log_format, log_level: of its log, unless its file says it; empty: not said.
+    it does. log_format, log_level: of its log, unless its file says it; empty: not said. blackbox: of its black box,
+    unless its file says it. died: how the process before it ended, if it did not end in order; hung: it was killed
+    because it sent no heartbeat.
     """
 
     file: str
@@ -117,6 +120,9 @@ class Fork(msgspec.Struct, frozen=True, tag="fork"):
     verbose: bool = False
     log_format: str = ""
     log_level: str = ""
+    blackbox: BlackBoxSettings | None = None
+    died: str = ""
+    hung: bool = False
 
 
 class Forked(msgspec.Struct, frozen=True, tag="forked"):

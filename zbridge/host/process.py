@@ -48,6 +48,13 @@ METRICS_BYTES = 256 * 1024
 _decode_metrics = msgspec.msgpack.Decoder(list[FamilyLines]).decode
 
 
+class Death(msgspec.Struct, frozen=True):
+    """How a process ended that did not end in order. hung: it was killed because it sent no heartbeat."""
+
+    how: str
+    hung: bool = False
+
+
 class GatewayProcess:
     """A forked gateway, a child of this process. Holds what it deposited until :meth:`close`.
 
@@ -74,6 +81,8 @@ class GatewayProcess:
         self.succeeded = False
         """Whether a successor has the robot."""
         self.asked_to_end = False
+        self.hung = False
+        """Whether it was killed because it sent no heartbeat."""
         self.watchdog = Watchdog(time.monotonic())
         self.over: asyncio.Future[int] = asyncio.get_running_loop().create_future()
         """Done when the process has ended; its wait status."""
@@ -132,8 +141,9 @@ class GatewayProcess:
                 if pid:
                     self.over.set_result(status)
 
-    def kill(self, why: str) -> None:
-        """End the process now: it counts as one that crashed."""
+    def kill(self, why: str, *, hung: bool = False) -> None:
+        """End the process now: it counts as one that crashed. hung: because it sent no heartbeat."""
+        self.hung = hung or self.hung
         self._killed = self._killed or why
         self.signal(signal.SIGKILL)
         self._left.set()

@@ -22,6 +22,7 @@ from typing import NoReturn
 
 import msgspec
 
+from zbridge.blackbox import BlackBoxSettings
 from zbridge.errors import HandoverError
 from zbridge.host.fd_channel import FromGateway, in_memory
 from zbridge.host.settings import HostSettings
@@ -75,10 +76,10 @@ class ServerState(msgspec.Struct, frozen=True):
 class SupervisorState(msgspec.Struct, frozen=True, tag_field="version", tag=VERSION):
     """What a supervisor runs; in place of other code also what that code knew.
 
-    log_format, log_level: as in :class:`~zbridge.host.fd_channel.Fork`. listen: host:port of the metrics; empty: they
-    are not served. sockets: descriptors that listen there. at: the time of the replacement, None: this supervisor was
-    just started. reload: whether SIGHUP came and is not yet answered. is_ready: whether systemd knows that every
-    gateway has begun.
+    log_format, log_level, blackbox: as in :class:`~zbridge.host.fd_channel.Fork`. listen: host:port of the metrics;
+    empty: they are not served. sockets: descriptors that listen there. at: the time of the replacement, None: this
+    supervisor was just started. reload: whether SIGHUP came and is not yet answered. is_ready: whether systemd knows
+    that every gateway has begun.
     """
 
     sources: tuple[str, ...]
@@ -88,6 +89,7 @@ class SupervisorState(msgspec.Struct, frozen=True, tag_field="version", tag=VERS
     log_format: str = ""
     log_level: str = ""
     listen: str = ""
+    blackbox: BlackBoxSettings | None = None
     sockets: tuple[int, ...] = ()
     at: float | None = None
     reload: bool = False

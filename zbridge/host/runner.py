@@ -40,7 +40,7 @@ from zbridge.host.duplicates import PERIOD_S, TIMES
 from zbridge.host.fd_channel import FdChannel, Fork
 from zbridge.host.files import RobotFile
 from zbridge.host.fork_client import ForkClient
-from zbridge.host.process import KILLED_S, GatewayProcess
+from zbridge.host.process import KILLED_S, Death, GatewayProcess
 from zbridge.host.replacement import RunnerState
 from zbridge.host.succession import GONE_S, Launcher, Succession
 from zbridge.host.watchdog import HEALTHY_S, RestartDelay
@@ -95,6 +95,8 @@ class Runner:
         """Cleared while the robot of a process that died is stopped."""
         self._attended.set()
         self._ending = False
+        self._died: Death | None = None
+        """How the last process died, until another one is started."""
         self._now = asyncio.Event()
         """Set to start the next process without waiting."""
         self._next_at: float | None = None
@@ -143,10 +145,11 @@ class Runner:
         while not self._ending:
             began = time.monotonic() - (self.process.lived_s if self.process is not None else 0.0)
             try:
-                self.process = self.process or await self._launcher.start(self.file)
+                self.process = self.process or await self._launcher.start(self.file, died=self._died)
             except NotReady as error:
                 log.error("no_process", "{robot}: no process: {error}", robot=self.file.robot, error=error)
             else:
+                self._died = None
                 await self._supervise()
             self._changed()
             if not self._ending:
@@ -203,13 +206,14 @@ class Runner:
     async def _crashed(self, process: GatewayProcess, how: str) -> GatewayProcess | None:
         """Stop the robot of a process that died; give the process that has its connections, None if none has."""
         self._attended.clear()
+        self._died = died = Death(f"process {process.pid} {how}", process.hung)
         log.error("process_died", "{robot}: process {pid} {how}", robot=self.file.robot, pid=process.pid, how=how)
         await process.deposit.stop(1)  # before anything that may take time
         stopped = asyncio.ensure_future(self._repeat_stop(process))
         await self._succession.give_up()
         successor = None
         if not self._ending and not process.asked_to_end and process.deposit.has_links:
-            successor = await self._inherited(process, stopped)
+            successor = await self._inherited(process, stopped, died)
         await stopped
         if successor is None:
             await process.deposit.drain()
@@ -218,7 +222,9 @@ class Runner:
         self._attended.set()
         return successor
 
-    async def _inherited(self, process: GatewayProcess, stopped: asyncio.Future[None]) -> GatewayProcess | None:
+    async def _inherited(
+        self, process: GatewayProcess, stopped: asyncio.Future[None], died: Death
+    ) -> GatewayProcess | None:
         """Start a successor of a dead process that keeps its connections; None if that is not possible."""
         reason = ""
         if not await process.gone(GONE_S):
@@ -229,7 +235,7 @@ class Runner:
             if self._ending:
                 return None
             try:
-                successor = await self._succession.offer(process, self.file.path, stopped)
+                successor = await self._succession.offer(process, self.file.path, stopped, died)
             except (HandoverError, NotReady, OSError) as error:
                 reason = str(error)
             else:

@@ -130,7 +130,7 @@ class Runners:
             if late_s > LATE_S:
                 process.watchdog.extend()
             if not process.over.done() and now >= process.watchdog.deadline:
-                process.kill(f"sent no heartbeat for {process.watchdog.silent_s(now):.1f} s")
+                process.kill(f"sent no heartbeat for {process.watchdog.silent_s(now):.1f} s", hung=True)
             elif not process.over.done():
                 deadlines.append(process.watchdog.deadline)
         self.check_at = max(now + 0.01, min(deadlines))

@@ -12,6 +12,7 @@ from typing import Annotated
 import msgspec
 
 from zbridge.app.config import GatewayPlan, LogSettings, MetricsSettings
+from zbridge.blackbox import BlackBoxSettings
 from zbridge.errors import ConfigError
 from zbridge.host.addresses import Addresses, resolve
 from zbridge.toml import FILE_BYTES, prefixed, read_struct
@@ -35,11 +36,16 @@ class HostSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class HostFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """``host.toml``. metrics: of all gateways. log: of the supervisor, and of gateways whose files have no table."""
+    """``host.toml``.
+
+    metrics: of all gateways. log: of the supervisor, and of gateways whose files have no table. blackbox: of gateways
+    whose files have no table.
+    """
 
     host: HostSettings = HostSettings()
     log: LogSettings = LogSettings()
     metrics: MetricsSettings | None = None
+    blackbox: BlackBoxSettings | None = None
 
 
 def load_host(directory: Path) -> HostFile:
@@ -50,6 +56,13 @@ def load_host(directory: Path) -> HostFile:
         with prefixed(f"{path}: "):
             found.metrics.address  # noqa: B018 - raises
     return found
+
+
+def with_host(plan: GatewayPlan, host: HostFile) -> GatewayPlan:
+    """Return a gateway's plan with what ``host.toml`` says, where the robot's file says nothing."""
+    if plan.config.blackbox is not None or host.blackbox is None or plan.device is None:
+        return plan
+    return msgspec.structs.replace(plan, config=msgspec.structs.replace(plan.config, blackbox=host.blackbox))
 
 
 def robot_files(directory: Path) -> list[Path]:

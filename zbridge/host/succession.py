@@ -23,7 +23,7 @@ from zbridge.host.duplicates import PERIOD_S
 from zbridge.host.fd_channel import FdChannel, Fork, Started
 from zbridge.host.files import RobotFile, read
 from zbridge.host.fork_client import ForkClient
-from zbridge.host.process import GatewayProcess
+from zbridge.host.process import Death, GatewayProcess
 from zbridge.log import Log
 from zbridge.transport import Parcel
 
@@ -58,10 +58,13 @@ class Launcher:
     def __repr__(self) -> str:
         return f"<Launcher by {self._forks!r}>"
 
-    async def start(self, file: RobotFile, take_over: int | None = None, *, at_once: bool = False) -> GatewayProcess:
+    async def start(
+        self, file: RobotFile, take_over: int | None = None, *, at_once: bool = False, died: Death | None = None
+    ) -> GatewayProcess:
         """Fork a process; raise NotReady with the reason: also that the file is gone, whatever stood in it.
 
-        take_over: descriptor of the socket by which it takes over. at_once: without a check of the installation.
+        take_over: descriptor of the socket by which it takes over. at_once: without a check of the installation. died:
+        how the process before it died.
         """
         if not await _is_there(file.path):
             raise NotReady(f"{file.path} is gone")
@@ -69,7 +72,8 @@ class Launcher:
             channel, far = FdChannel.pair()
         except OSError as error:
             raise NotReady(error.strerror or str(error)) from error
-        request = msgspec.structs.replace(self._request, file=str(file.path), robot=file.robot)
+        how, hung = (died.how, died.hung) if died is not None else ("", False)
+        request = msgspec.structs.replace(self._request, file=str(file.path), robot=file.robot, died=how, hung=hung)
         try:
             with far:
                 pid = await self._forks.fork(request, far, file.content, take_over, at_once=at_once)
@@ -177,10 +181,13 @@ class Succession:
 
     # After a crash
 
-    async def offer(self, process: GatewayProcess, path: Path, stopped: Awaitable[object]) -> GatewayProcess:
+    async def offer(
+        self, process: GatewayProcess, path: Path, stopped: Awaitable[object], died: Death
+    ) -> GatewayProcess:
         """Offer what a dead process left to a new one, which runs by the same content; return it when it has the robot.
 
-        path: of the file now. stopped: done when the robot's stop is written. Raise HandoverError, NotReady or OSError.
+        path: of the file now. stopped: done when the robot's stop is written. died: how the process died. Raise
+        HandoverError, NotReady or OSError.
         """
         given, parcel = process.deposit.inheritance()
         file = msgspec.structs.replace(process.file, path=path)
@@ -188,7 +195,7 @@ class Succession:
             near, far = socket.socketpair()
             with contextlib.closing(HandoverChannel(near)) as channel:
                 with far:
-                    self.successor = successor = await self._launcher.start(file, far.fileno(), at_once=True)
+                    self.successor = successor = await self._launcher.start(file, far.fileno(), at_once=True, died=died)
                 try:
                     await _give(channel, given, parcel)
                     await stopped

@@ -208,7 +208,7 @@ class Supervisor:
 
     def _runner(self, file: RobotFile) -> Runner:
         state = self._state
-        request = Fork("", "", state.verbose, state.log_format, state.log_level)
+        request = Fork("", "", state.verbose, state.log_format, state.log_level, state.blackbox)
         return Runner(file, self._forks, request, changed=self._changed, most_bytes=state.host.file_bytes)
 
     def _changed(self) -> None:

@@ -114,6 +114,12 @@ GROUPS: dict[str, tuple[Family, ...]] = {
             ("audit_lines_dropped", "Lines of the audit log that were lost."),
         ),
     ),
+    "Black box": _counters(
+        ("blackbox_bytes", "Bytes written to the black box."),
+        ("blackbox_lost", "Messages that the black box lost: the queue was full, or the disk took nothing.", "reason"),
+        ("blackbox_incidents", "Incidents that were kept, by the code of their first cause.", "code"),
+        ("blackbox_incidents_removed", "Incidents that were deleted to make room for newer ones."),
+    ),
     "Bus": (
         *_gauges(
             (

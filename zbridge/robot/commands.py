@@ -51,6 +51,7 @@ class Commands:
         self._keys = context.keys
         self._clock = context.clock
         self._pump = context.pump
+        self._box = context.box
         self._closing: str | None = None
         self._awaiting: _Awaiting | None = None
         """A mode that is carried out once it is written down."""
@@ -67,6 +68,8 @@ class Commands:
     def take(self, sample: Sample) -> None:
         """Carry out one command, or refuse it and show the refusal on ``control``."""
         self._enforcer.keep_time()
+        if self._box is not None:
+            self._box.put(sample.key, sample.payload, sample.attachment)
         sender = topic = None
         try:
             topic = self._topics.get(sample.key)

@@ -20,7 +20,7 @@ from zbridge.protocol.address import DeviceAddress
 from zbridge.protocol.kept import Budget, Exported
 from zbridge.protocol.session import Session, State
 from zbridge.protocol.session_table import Backoff, SessionTable
-from zbridge.robot.wire_tap import WireTap
+from zbridge.robot.wire_tap import Tap, WireTap
 from zbridge.transport import Conversation, ConversationHooks, Link, Parcel, attach, connect
 from zbridge.transport.reading import FairShare
 from zbridge.wire.frames import Partial
@@ -56,6 +56,8 @@ class LinkSettings(msgspec.Struct, frozen=True, kw_only=True):
     """Between 0 and 1."""
     share: FairShare | None = None
     """Of the processor, where the process serves other robots too."""
+    tap: Callable[[str], Tap | None] = lambda name: None
+    """``tap(name)``: returns what is called with every raw frame of a link; None: nothing is."""
     shared: bool = False
     """Whether gateways of other robots may connect to the same addresses."""
 
@@ -142,7 +144,7 @@ class Connection:
         self._restored: tuple[Exported, Parcel] | None = None
         """The link of another process, until it is attached."""
         self._muted = False
-        self.wire = WireTap(label)
+        self.wire = WireTap(label, settings.tap(name))
         """Shows the raw frames."""
 
     def __repr__(self) -> str:

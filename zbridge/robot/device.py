@@ -92,9 +92,9 @@ class RobotDevice(Transferable):
         self._on_demand: list[OnDemand] = []
         self._observer = watching = observer or Observer()  # a plain Observer ignores everything
         bus, keys, conditions = context.bus, context.keys, context.conditions
-        self._publishers = RobotPublishers(bus, keys, conditions, context.clock, watching.published)
+        self.publishers = RobotPublishers(bus, keys, conditions, context.clock, watching.published, context.box)
         self._links = links = Links()
-        publish = self._publishers.publish
+        publish = self.publishers.publish
         self._context = context = msgspec.structs.replace(context, publish=publish, pump=links.pump)  # now complete
         self._pending = pending = PendingQueries(loop)
         self._standstill = Standstill(context, control.authority, control.idle_stop_s)
@@ -107,7 +107,7 @@ class RobotDevice(Transferable):
         self._latch_news = FleetLatchNews(bus, keys, enforcer, self._leases, settings.chance)
         self._commands = Commands(context, enforcer)
         self._queries = Queries(context, self._commands, pending)
-        self._telemetry = Telemetry(context, self._publishers, pending, links)
+        self._telemetry = Telemetry(context, self.publishers, pending, links)
         self._presence = Presence(
             context, protocol, links, enforcer, self._standstill, self._commands, pending, watching
         )
@@ -152,7 +152,7 @@ class RobotDevice(Transferable):
             await begin()
             await self.resume()
             if self._crashed:
-                self._publishers.repeat()
+                self.publishers.repeat()
             self._show()
         if not self.observed.aside:
             self._standstill.begin()
@@ -187,7 +187,7 @@ class RobotDevice(Transferable):
     def _session(self, link: str, address: str) -> Session[Any]:
         """Make the session of a new connection; the names of the one before it are given up."""
         if link == self._links.first.name:
-            self._publishers.forget_names()
+            self.publishers.forget_names()
         return self._context.robot.session(link, address)
 
     def _refuse_all(self, reason: str | None) -> None:
@@ -205,7 +205,7 @@ class RobotDevice(Transferable):
     async def _beat(self) -> None:
         while True:
             await asyncio.sleep(HEARTBEAT_S)
-            self._publishers.expire()
+            self.publishers.expire()
             self._context.conditions.expire()
             if self._commanded:  # else another gateway, or the next process, says it
                 self._presence.publish_status()
@@ -245,7 +245,7 @@ class RobotDevice(Transferable):
         self.observed.aside = True
         self._standstill.close()
         await self.withdraw()
-        self._publishers.mute(True)
+        self.publishers.mute(True)
         await self._stop_written()
         self.enforcer.lease_hook.forget()
         for connection in self._links:
@@ -260,7 +260,7 @@ class RobotDevice(Transferable):
         self.observed.aside = False
         for connection in self._links:
             connection.mute(False)
-        self._publishers.mute(False)
+        self.publishers.mute(False)
         self._listen()
         self._refuse_all(None)
         self._latch_news.returned()
@@ -306,7 +306,7 @@ class RobotDevice(Transferable):
         return {
             "links": [connection.export(parcel, budget) for connection in self._links],
             "robot": self._context.robot.export(budget),
-            "published": self._publishers.export(budget),
+            "published": self.publishers.export(budget),
             "latches": self.enforcer.authority.latches.export(),
             "aside": self.observed.aside,
         }
@@ -331,7 +331,7 @@ class RobotDevice(Transferable):
         """
         self._refuse_all(_TAKING_OVER)
         self._crashed = bool(state.get(_CRASHED))
-        self.observed.aside = self._publishers.muted = state["aside"]
+        self.observed.aside = self.publishers.muted = state["aside"]
         for connection in self._links:
             connection.mute(self.observed.aside)
         self.enforcer.authority.restore_latches(state["latches"])
@@ -341,7 +341,7 @@ class RobotDevice(Transferable):
             connection.restore(link, parcel)
         if not self._crashed:
             self._latch_news.inherited()
-        self._publishers.restore(state["published"])  # a new session gives up the names of the one before it
+        self.publishers.restore(state["published"])  # a new session gives up the names of the one before it
         if any(state["links"]):
             self._context.robot.restore(state["robot"])
         session = self._context.robot.driving
@@ -395,4 +395,4 @@ class RobotDevice(Transferable):
         self._context.conditions.changed = lambda: None
         for handle in (*self._commanded, *self._on_demand, *self._declared):
             handle.close()
-        self._publishers.close()
+        self.publishers.close()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
+from zbridge.blackbox import BlackBox
 from zbridge.bus import Bus, Publisher
 from zbridge.control.faults import Conditions, FaultCode
 from zbridge.fleet import payload as payloads
@@ -31,7 +32,10 @@ class _Muted:
 
 
 class RobotPublishers:
-    """Publishes on the keys of one robot. clock: seconds. kept: called for each new key that keeps its last value."""
+    """Publishes on the keys of one robot.
+
+    clock: seconds. kept: called for each new key that keeps its last value. box: records what is published.
+    """
 
     def __init__(
         self,
@@ -40,7 +44,9 @@ class RobotPublishers:
         conditions: Conditions,
         clock: Callable[[], float],
         kept: Callable[[], object] = lambda: None,
+        box: BlackBox | None = None,
     ) -> None:
+        self._box = box
         self.known: dict[str, Publisher] = {}
         """The publishers there are, by path."""
         self._bus = bus
@@ -62,7 +68,10 @@ class RobotPublishers:
         """Publish a message; drop it where the robot has too many names."""
         publisher = self.get(topic)
         if publisher is not None:
-            publisher.put(payloads.encode(message))
+            payload = payloads.encode(message)
+            publisher.put(payload)
+            if self._box is not None and not self.muted:
+                self._box.put(publisher.key, payload)
 
     def get(self, topic: Topic) -> Publisher | None:
         """Return the publisher of a topic; None if the robot has too many names."""
@@ -96,6 +105,10 @@ class RobotPublishers:
         """List the keys, each with the last value that it keeps. budget: of a deposit, which lacks large values."""
         known = [(path, publisher.last) for path, publisher in self.known.items()]
         return [[path, last if budget is None or budget.admits(path, last) else None] for path, last in known]
+
+    def states(self) -> list[tuple[str, bytes]]:
+        """List keys and last values of all that keep it."""
+        return [(publisher.key, last) for publisher in self.known.values() if (last := publisher.last) is not None]
 
     def restore(self, known: Iterable[tuple[str, bytes | None]]) -> None:
         """Declare the keys of another process, which answer for their last values; nothing is published."""

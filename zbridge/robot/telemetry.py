@@ -11,6 +11,7 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
+from zbridge.blackbox import BlackBox
 from zbridge.bus import Publisher
 from zbridge.control.context import RobotContext
 from zbridge.errors import ProtocolError, Refused
@@ -59,6 +60,7 @@ class Telemetry:
         self._links = links
         self._translators: dict[type, Translate] = {}
         self._counts = _Published(context.metrics)
+        self._box = context.box
         self._untranslatable = context.metrics.count("untranslatable_messages")
         self._unnamed = context.metrics.count("names_dropped")
 
@@ -87,7 +89,7 @@ class Telemetry:
         """Publish what the robot sent; the newest wins where the bus is slower, unless it is told to block."""
         stamp_ns = self._clock_ns()
         encode, translators, waiting = payloads.encode, self._translators, self._pending.waiting
-        publishers, known, counts = self._publishers, self._publishers.known, self._counts
+        publishers, known = self._publishers, self._publishers.known
         streams: dict[str, list[bytes]] = {}
         flowing = True
         for number, message in enumerate(messages, 1):
@@ -105,25 +107,39 @@ class Telemetry:
                     elif topic.delivery is Delivery.STREAM:
                         streams[topic.path] = [payload]
                     else:
-                        flowing = publisher.put(payload) and flowing
-                        messages_out, bytes_out = counts[topic.path]
-                        messages_out.value += 1
-                        bytes_out.value += len(payload)
+                        flowing = self._publish_state(publisher, topic, payload) and flowing
                     if waiting:
                         self._pending.answer(topic, payload)
             except ProtocolError as error:
                 self._untranslatable.value += 1
                 log.debug("message_untranslatable", "{robot}: {error}", robot=self._context.keys.robot, error=error)
-        batch = []
+        if streams:
+            flowing = self._publish_streams(streams) and flowing
+        if not flowing:
+            self._links.pause_reading()
+
+    def _publish_state(self, publisher: Publisher, topic: Topic, payload: bytes) -> bool:
+        """Publish one state; False if the bus asks to pause."""
+        messages_out, bytes_out = self._counts[topic.path]
+        messages_out.value += 1
+        bytes_out.value += len(payload)
+        if self._box is not None and not self._publishers.muted:
+            self._box.put(publisher.key, payload)
+        return publisher.put(payload)
+
+    def _publish_streams(self, streams: dict[str, list[bytes]]) -> bool:
+        """Publish the streams of one read; False if the bus asks to pause."""
+        known, counts, batch = self._publishers.known, self._counts, []
         for path, stream in streams.items():
             batch.append((known[path], stream))
             messages_out, bytes_out = counts[path]
             messages_out.value += len(stream)
             bytes_out.value += len(stream[0]) if len(stream) == 1 else sum(map(len, stream))
-        if streams and not publishers.muted:
-            flowing = self._bus.put_all(batch) and flowing
-        if not flowing:
-            self._links.pause_reading()
+        if self._publishers.muted:
+            return True
+        if self._box is not None:
+            _record(self._box, batch)
+        return self._bus.put_all(batch)
 
     def _translator(self, kind: type) -> Translate:
         translate = self._translators[kind] = self._context.robot.translator(kind)
@@ -152,3 +168,11 @@ class Telemetry:
                     self._context.faults.note(topic.path, error)
 
         return listened
+
+
+def _record(box: BlackBox, batch: list[tuple[Publisher, list[bytes]]]) -> None:
+    """Put streams into the black box; images are too large for it."""
+    for publisher, stream in batch:
+        if not publisher.key.endswith(f"/{topics.IMAGE.path}"):
+            for payload in stream:
+                box.put(publisher.key, payload)

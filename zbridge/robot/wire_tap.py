@@ -12,11 +12,13 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
+from zbridge.blackbox import BlackBox
+from zbridge.fleet.topics import WIRE_DATAGRAM, KeySpace
 from zbridge.log import Log
-from zbridge.protocol.session import Session, State
+from zbridge.protocol.session import Datagram, Session, State
 
 log = Log("zbridge.link")
 
@@ -35,10 +37,32 @@ Entry = tuple[int, str, bytes]
 """The running number of a frame, its direction (``in`` or ``out``), and the frame."""
 
 
-class WireTap:
-    """Follows the conversations of one link. label: of the link in the log."""
+Tap = Callable[[str, bytes], None]
+"""``tap(direction, frame)``."""
 
-    def __init__(self, label: str) -> None:
+
+def recording(box: BlackBox | None, keys: KeySpace, link: str) -> Tap | None:
+    """Return a tap that puts the frames of a link into the black box; None where there is none."""
+    if box is None:
+        return None
+    put, by_direction = box.put, wire_keys(keys, link)
+
+    def record(direction: str, frame: bytes) -> None:
+        put(by_direction[direction], frame, WIRE_DATAGRAM if type(frame) is Datagram else None)
+
+    return record
+
+
+def wire_keys(keys: KeySpace, link: str) -> Mapping[str, str]:
+    """Return the keys of a link's raw frames, by direction."""
+    return {direction: keys.key(f"@wire/{link}/{direction}") for direction in ("in", "out")}
+
+
+class WireTap:
+    """Follows the conversations of one link. label: of the link in the log. record: called with every frame."""
+
+    def __init__(self, label: str, record: Tap | None = None) -> None:
+        self._record = record
         self._label = label
         self._session: Session[Any] | None = None
         self._shows: dict[str, Show] = {}
@@ -72,6 +96,8 @@ class WireTap:
             self._session.tap = self._take
 
     def _take(self, direction: str, frame: bytes) -> None:
+        if self._record is not None:
+            self._record(direction, frame)
         debug = log.enabled(logging.DEBUG)
         if debug:
             mark, start = "<" if direction == "in" else ">", frame[:_LOGGED].hex(" ")
@@ -87,7 +113,7 @@ class WireTap:
             self._kept.append(entry)
             self._kept_bytes += len(frame)
         elif not (debug or self._shows or self._waiting is not None) and self._session is not None:
-            self._session.tap = None
+            self._session.tap = self._record
 
     @property
     def _keeps(self) -> bool:

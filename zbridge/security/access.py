@@ -68,6 +68,9 @@ class Keys(Enum):
     SESSIONS = ("{robot}/@rpc/sessions/*",)
     LATCH = ("{robot}/@rpc/latch",)
     CLAIM = ("{robot}/@rpc/claim/gateway",)
+    INCIDENTS = ("{robot}/@rpc/blackbox/incidents",)
+    INCIDENT_READ = ("{robot}/@rpc/blackbox/read/{name}",)
+    INCIDENT_KEEP = ("{robot}/@rpc/blackbox/keep/{name}",)
     RPC = ("{robot}/@rpc/**",)
     HQ_ACQUIRE = ("{robot}/@rpc/control/acquire/hq.{name}", "{robot}/@rpc/control/acquire/hq.{name}.$*")
     HQ_REFUSED = ("{robot}/@rpc/control/refused/hq.{name}", "{robot}/@rpc/control/refused/hq.{name}.$*")
@@ -106,6 +109,7 @@ _VIEWER = (
     Grant(Keys.STATS, _LISTEN),
     Grant(Keys.ALIVE, _SEE),
     Grant(Keys.SESSIONS, (MessageKind.QUERY,)),
+    Grant(Keys.INCIDENTS, (MessageKind.QUERY,)),
     Grant(Keys.STOP, (MessageKind.PUT,)),
     Grant(Keys.WHOAMI, (MessageKind.QUERY,)),
 )
@@ -113,6 +117,7 @@ _DRIVER = (
     *_VIEWER,
     Grant(Keys.COMMANDS, (MessageKind.PUT,)),
     Grant(Keys.MARK, (MessageKind.PUT,)),
+    Grant(Keys.INCIDENT_KEEP, (MessageKind.QUERY,)),
     Grant(Keys.ACQUIRE, (MessageKind.QUERY,)),
     Grant(Keys.LEASE, (MessageKind.QUERY,)),
     Grant(Keys.ASK, (MessageKind.QUERY,)),
@@ -124,6 +129,7 @@ _SUPERVISOR = (
     Grant(Keys.TAKEOVER, (MessageKind.QUERY,)),
     Grant(Keys.UNLATCH_FLEET, (MessageKind.QUERY,)),
     Grant(Keys.RESTART, (MessageKind.QUERY,)),
+    Grant(Keys.INCIDENT_READ, (MessageKind.QUERY,)),
     Grant(Keys.WIRE, (MessageKind.SUBSCRIBE,)),
     Grant(Keys.ADMIN, (MessageKind.QUERY,)),
 )

@@ -39,6 +39,7 @@ class Right(Enum):
     RESTART = ("restart its gateway", ("supervisor",))
     UNLATCH = ("release its latched stop", ("operator", "supervisor"))
     MARK = ("write a mark", ("operator", "supervisor", "hq"))
+    READ_INCIDENT = ("read its incidents", ("supervisor",))
     UNLATCH_FLEET = ("release the fleet's latched stop", ("supervisor",))
 
 

@@ -1,0 +1,150 @@
+"""The black box of a gateway: opened and closed with it, and what it answers on the bus.
+
+``@rpc/blackbox/incidents`` lists the incidents, ``@rpc/blackbox/read/<name>`` returns a part of one of their files, and
+``@rpc/blackbox/keep/<name>`` keeps the minutes before now. The disk is read on another thread, one question at a time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import platform
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from zbridge.app.config import GatewayPlan
+from zbridge.blackbox import BlackBox, BlackBoxSettings, BoxFolder
+from zbridge.blackbox.reading import list_incidents, read_part
+from zbridge.bus import Bus, Handle, IncomingQuery
+from zbridge.control.admission import NameFilter
+from zbridge.control.faults import Conditions, FaultCode
+from zbridge.control.latch_store import state_folder
+from zbridge.errors import Malformed, NotReady, PayloadError, Refused, ZbridgeError
+from zbridge.fleet import payload as payloads
+from zbridge.fleet.incidents import ReadIncident
+from zbridge.fleet.messages import Query, Text
+from zbridge.fleet.topics import KeySpace, is_concrete, unescape
+from zbridge.tasks import Tasks
+from zbridge.version import __version__
+
+MARK = "mark"
+"""The code of an incident that somebody asked for."""
+WAITING = 8
+"""Questions for the disk that may wait."""
+_OF_THE_PROCESS_BEFORE = (FaultCode.GATEWAY_DIED, FaultCode.GATEWAY_HUNG)
+
+
+def box_folder(settings: BlackBoxSettings, state: Path | None = None) -> Path:
+    """Return the folder of all black boxes. state: where latched stops are kept; None: the usual folder."""
+    if settings.dir is not None:
+        return Path(settings.dir)
+    return (state if state is not None else state_folder()) / "blackbox"
+
+
+@contextlib.contextmanager
+def open_black_box(
+    plan: GatewayPlan, keys: KeySpace, conditions: Conditions, state: Path | None, gone: Callable[[], bool], alone: bool
+) -> Iterator[BlackBox | None]:
+    """Yield the black box of a gateway, which is to be begun; None without ``[blackbox]``.
+
+    gone: whether a successor serves everything. alone: whether the process serves no other robot.
+    """
+    settings = plan.config.blackbox
+    if settings is None or plan.device is None:
+        yield None
+        return
+    protocol = plan.device.protocol.name
+    box = BlackBox(
+        keys,
+        box_folder(settings, state),
+        settings,
+        {
+            "versions": {"zbridge": __version__, "python": platform.python_version(), "protocol": protocol},
+            "configuration": plan.written,
+        },
+        tell=lambda text: conditions.set(FaultCode.BLACK_BOX, text),
+        died=lambda text: _died(conditions, text),
+        alone=alone,
+    )
+    conditions.occurred = lambda code, text: box.keep(code, text, died=code in _OF_THE_PROCESS_BEFORE)
+    try:
+        yield box
+    except Exception as error:
+        box.close(error if not isinstance(error, ZbridgeError) else None)
+        raise
+    finally:
+        conditions.occurred = lambda code, text: None
+        box.close(handed_over=gone())
+
+
+def _died(conditions: Conditions, text: str) -> None:
+    """Note the end of the process before this one, unless the supervisor said why it ended."""
+    if not any(fault.code in _OF_THE_PROCESS_BEFORE for fault in conditions.faults):
+        conditions.happened(FaultCode.GATEWAY_DIED, text)
+
+
+class BoxServer:
+    """Answers questions about the black box of one robot, until :meth:`close`. clock: seconds."""
+
+    def __init__(self, bus: Bus, keys: KeySpace, box: BlackBox, clock: Callable[[], float]) -> None:
+        self._box = box
+        self._tasks = Tasks()
+        self._waiting = 0
+        self._disk = asyncio.Lock()
+        prefix = keys.key("@rpc/blackbox")
+        self._handles: list[Handle] = [
+            bus.answer(f"{prefix}/incidents", self._list),
+            bus.answer(f"{prefix}/read/*", self._read),
+            bus.answer(f"{prefix}/keep/*", self._keep, priority=NameFilter(clock)),
+        ]
+
+    def __repr__(self) -> str:
+        return f"<BoxServer {self._box!r}>"
+
+    def close(self) -> None:
+        """Answer no more; idempotent."""
+        while self._handles:
+            self._handles.pop().close()
+
+    def _list(self, question: IncomingQuery) -> None:
+        self._ask_disk(question, lambda: payloads.encode(list_incidents(self._box.folder)))
+
+    def _read(self, question: IncomingQuery) -> None:
+        def answer(folder: BoxFolder = self._box.folder) -> bytes:
+            return payloads.encode(read_part(folder, payloads.decode(ReadIncident, question.payload)))
+
+        self._ask_disk(question, answer)
+
+    def _keep(self, question: IncomingQuery) -> None:
+        try:
+            if not is_concrete(question.asked.rpartition("/")[2]):
+                raise Malformed("its key names nobody")
+            mark = payloads.decode(Text, question.payload)
+        except (Refused, PayloadError) as error:
+            question.refuse(error if isinstance(error, Refused) else Malformed(str(error)))
+            return
+        who = mark.sender or unescape(question.asked.rpartition("/")[2])
+        self._box.keep(MARK, f"{mark.text} ({who})")
+        question.answer(payloads.encode(Query()))
+
+    def _ask_disk(self, question: IncomingQuery, answer: Callable[[], bytes]) -> None:
+        if self._waiting >= WAITING:
+            question.refuse(NotReady("too many questions wait for the disk"))
+            return
+        self._waiting += 1
+        self._tasks.start(self._answer(question, answer))
+
+    async def _answer(self, question: IncomingQuery, answer: Callable[[], bytes]) -> None:
+        try:
+            async with self._disk:
+                payload = await asyncio.to_thread(answer)
+        except PayloadError as error:
+            question.refuse(Malformed(str(error)))
+        except Refused as error:
+            question.refuse(error)
+        except OSError as error:
+            question.refuse(NotReady(f"the disk: {error.strerror or error}"))
+        else:
+            question.answer(payload)
+        finally:
+            self._waiting -= 1

@@ -1,0 +1,298 @@
+"""The black box of one robot as its gateway uses it: a queue that the disk's thread empties. Never waits for the disk.
+
+All methods but :meth:`BlackBox.log_line` are for the event loop. What finds no room is dropped and counted.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+from zbridge.blackbox.disk_thread import DISK, DiskThread
+from zbridge.blackbox.incidents import BoxFolder, IncidentCause
+from zbridge.blackbox.segments import LOG, LogLine, Record, SegmentHead
+from zbridge.blackbox.settings import SEGMENT_S, BlackBoxSettings
+from zbridge.blackbox.spool import Item, Keep, NextSegment, Spool
+from zbridge.errors import describe
+from zbridge.fleet import payload as payloads
+from zbridge.fleet.topics import KeySpace
+from zbridge.log import Log, current_robot
+from zbridge.metrics import Reading
+
+log = Log("zbridge.blackbox")
+
+QUEUE_BYTES = 1_000_000
+"""Messages that may wait for the disk, with what each costs in memory."""
+RECORD_BYTES = 150
+"""What a message costs in memory besides its payload, about."""
+WAKE_BYTES = QUEUE_BYTES // 3
+"""The thread begins at once when so much waits."""
+LINES = 500
+"""Log lines that may wait."""
+LINE_CHARACTERS = 2000
+"""Characters of a log line; a longer one is cut."""
+SMALL_BYTES = 4096
+"""A larger state is repeated in every :data:`LARGE_EVERY`-th segment only."""
+LARGE_EVERY = 10
+KEEP_S = 1.0
+"""Least time between two causes of one code that are noted."""
+FRAME_S = 5.0
+"""Least time between two recordings of all states for a cause."""
+STUCK_S = 5.0
+"""A disk that answers nothing for so long hangs."""
+CLOSE_S = 1.0
+"""Longest wait for the disk at the end."""
+
+Snapshot = Callable[[], Iterable[tuple[str, bytes]]]
+"""Returns keys and payloads of the last value of every state, and of the session table."""
+
+
+class BlackBox:
+    """The black box of one robot, from :meth:`begin` to :meth:`close`.
+
+    about: what is in each segment: versions, and the configuration without secrets. tell: called with what is wrong
+    with the box, None when it is right again. died: called with a text if the process before this one ended without
+    taking leave. alone: whether the process serves no other robot, so that all its log lines are this robot's.
+    """
+
+    def __init__(
+        self,
+        keys: KeySpace,
+        folder: Path,
+        settings: BlackBoxSettings,
+        about: dict[str, Any],
+        *,
+        tell: Callable[[str | None], object] = lambda text: None,
+        died: Callable[[str], object] = lambda text: None,
+        alone: bool = True,
+        disk: DiskThread = DISK,
+    ) -> None:
+        self.folder = BoxFolder(folder, keys.realm, keys.robot)
+        self.snapshot: Snapshot = tuple
+        self.incidents = Counter[str]()
+        """Incidents that began, by the code of their first cause; ``removed``: that were deleted."""
+        self._keys = keys
+        self._about = about
+        self._tell = tell
+        self._died = died
+        self._alone = alone
+        self._disk = disk
+        self._spool = Spool(self.folder, settings, self._head, self._count)
+        self._boot = _boot_id()
+        self._waiting: deque[Item] = deque()
+        self._lines: deque[Record] = deque(maxlen=LINES)
+        self._put_bytes = self._taken_bytes = 0
+        self._full = 0
+        """Messages that found no room."""
+        self._segments = 0
+        self._repeated: dict[str, int] = {}
+        """The segment in which a large state was repeated last."""
+        self._kept_at: dict[str, float] = {}
+        self._framed_at = 0.0
+        self._worked_at = 0.0
+        """When the thread ended its last round."""
+        self._told: str | None = None
+        self._begun = self._ready = False
+        self._ending: bool | None = None
+        """Whether the robot was handed over; None: it does not end."""
+        self._ended = threading.Event()
+        self._timer: asyncio.TimerHandle | None = None
+        self._handler = _BoxHandler(self)
+        self._loop = asyncio.get_running_loop()
+
+    def __repr__(self) -> str:
+        return f"<BlackBox {self.folder.path.name} {len(self._waiting)} waiting, {self.lost} lost>"
+
+    @property
+    def lost(self) -> int:
+        """Messages that were lost so far."""
+        return self._full + self._spool.unwritten
+
+    def readings(self) -> Iterator[Reading]:
+        """Read the metrics."""
+        yield "blackbox_bytes", {}, self._spool.bytes
+        yield "blackbox_lost", {"reason": "queue"}, self._full
+        yield "blackbox_lost", {"reason": "disk"}, self._spool.unwritten
+        for code, number in dict(self.incidents).items():
+            if code == "removed":
+                yield "blackbox_incidents_removed", {}, number
+            else:
+                yield "blackbox_incidents", {"code": code}, number
+
+    def begin(self) -> None:
+        """Begin to write; idempotent."""
+        if not self._begun:
+            self._begun = True
+            self._worked_at = time.monotonic()
+            logging.getLogger().addHandler(self._handler)
+            self._disk.add(self._work)
+            self._next_segment()
+
+    def close(self, error: BaseException | None = None, *, handed_over: bool = False) -> None:
+        """Write what waits, for :data:`CLOSE_S` at most; idempotent. error: the fault by which the gateway ends."""
+        if not self._begun or self._ending is not None:
+            return
+        logging.getLogger().removeHandler(self._handler)
+        if self._timer is not None:
+            self._timer.cancel()
+        if error is not None:
+            self._kept_at.clear()
+            self.keep("gateway_died", f"the gateway failed: {describe(error)}")
+        self._ending = handed_over
+        self._disk.wake()
+        self._ended.wait(CLOSE_S)
+        self._disk.remove(self._work)
+
+    def put(self, key: str, payload: bytes, attachment: bytes | None = None) -> None:
+        """Record a message, or drop and count it where too much waits."""
+        size = len(payload) + RECORD_BYTES
+        waiting = self._put_bytes - self._taken_bytes
+        if waiting > QUEUE_BYTES:
+            self._full += 1
+            return
+        self._put_bytes += size
+        self._waiting.append((time.monotonic_ns(), key, payload, attachment))
+        if waiting <= WAKE_BYTES < waiting + size:
+            self._disk.wake()
+
+    def keep(self, code: str, text: str, *, died: bool = False) -> None:
+        """Keep the minutes before now. died: those before the last segment of the process before this one."""
+        now, cause = time.monotonic(), IncidentCause(code, text, time.time_ns())
+        if not self._begun or now - self._kept_at.get(code, 0.0) < KEEP_S:
+            return
+        self._kept_at[code] = now
+        if now - self._framed_at < FRAME_S:
+            self._order(Keep(cause, died=died))
+            return
+        self._framed_at, frame = now, self._records(self.snapshot())
+        self._order(Keep(cause, frame, died))
+        self._order(NextSegment(frame))
+
+    def _order(self, order: Keep | NextSegment) -> None:
+        self._put_bytes += RECORD_BYTES
+        self._waiting.append(order)
+
+    def log_line(self, record: logging.LogRecord) -> None:
+        """Record a line of the log; from any thread."""
+        if not self._alone and current_robot.get() != self._keys.robot:
+            return
+        text = record.getMessage()
+        if record.exc_info and record.exc_info[1] is not None:
+            text += f" ({describe(record.exc_info[1])})"
+        event, stamp_ns = getattr(record, "event", None), int(record.created * 1e9)
+        line = LogLine(record.levelname.lower(), record.name, text[:LINE_CHARACTERS], event, stamp_ns=stamp_ns)
+        self._lines.append((time.monotonic_ns(), self._keys.key(LOG), payloads.encode(line), None))
+
+    # Segments
+
+    def _next_segment(self) -> None:
+        self._timer = self._loop.call_later(SEGMENT_S, self._next_segment)
+        now = time.monotonic()
+        if now - self._worked_at > STUCK_S:
+            self._report(f"the black box is not written: the disk has not answered for {now - self._worked_at:.0f} s")
+        self._segments += 1
+        if self._put_bytes - self._taken_bytes <= QUEUE_BYTES:
+            self._order(NextSegment(self._records(filter(self._is_due, self.snapshot()))))
+
+    def _is_due(self, state: tuple[str, bytes]) -> bool:
+        key, payload = state
+        if len(payload) <= SMALL_BYTES:
+            return True
+        is_due = self._segments >= self._repeated.get(key, -LARGE_EVERY) + LARGE_EVERY
+        if is_due:
+            self._repeated[key] = self._segments
+        return is_due
+
+    def _records(self, states: Iterable[tuple[str, bytes]]) -> list[Record]:
+        now_ns = time.monotonic_ns()
+        return [(now_ns, key, payload, None) for key, payload in states]
+
+    def _report(self, text: str | None) -> None:
+        if text != self._told:
+            if text is not None and self._told is None:
+                log.error("blackbox_not_written", "{reason}", reason=text)
+            elif text is None:
+                log.warning("blackbox_written_again", "the black box is written again: {lost} lost", lost=self.lost)
+            self._told = text
+            self._tell(text)
+
+    # On the thread
+
+    def _work(self) -> None:
+        """Write what waits; one round of the thread."""
+        try:
+            self._write()
+        except Exception:
+            log.exception("blackbox_failed", "the black box failed, and ends")
+            self._disk.remove(self._work)
+            self._ended.set()
+
+    def _write(self) -> None:
+        ending, spool, now = self._ending, self._spool, time.monotonic()
+        error = None if self._ready else self._open(spool, now)
+        lines: list[Item] = [self._lines.popleft() for _ in range(len(self._lines))]
+        items = [self._waiting.popleft() for _ in range(len(self._waiting))]
+        spool.write(lines + items, now)
+        self._taken_bytes += sum(RECORD_BYTES + (len(item[2]) if type(item) is tuple else 0) for item in items)
+        self._worked_at = time.monotonic()
+        error = error or spool.error
+        text = f"the black box is not written: {self.folder.path}: {error.strerror or error}" if error else None
+        if text != self._told:
+            self._call(self._report, text)
+        if ending is not None:
+            spool.close(handed_over=ending)
+            self._disk.remove(self._work)
+            self._ended.set()
+
+    def _open(self, spool: Spool, now: float) -> OSError | None:
+        """Begin with what the process before left; return why that failed: then it is tried again."""
+        try:
+            dead = spool.begin(now, time.time_ns())
+        except OSError as error:
+            return error
+        self._ready = True
+        if dead:
+            pids = ", ".join(map(str, dead))
+            self._call(self._died, f"process {pids} ended without taking leave: it crashed, was killed, or lost power")
+        return None
+
+    def _call(self, function: Callable[..., object], *arguments: object) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop has ended
+            self._loop.call_soon_threadsafe(function, *arguments)
+
+    def _head(self) -> SegmentHead:
+        keys = self._keys
+        times = (time.time_ns(), time.monotonic_ns())
+        return SegmentHead(keys.realm, keys.robot, self._boot, os.getpid(), *times, self.lost, self._about)
+
+    def _count(self, what: str) -> None:
+        self.incidents[what] += 1
+
+
+class _BoxHandler(logging.Handler):
+    """Gives the lines of the log to a black box."""
+
+    def __init__(self, box: BlackBox) -> None:
+        super().__init__(logging.INFO)
+        self._box = box
+
+    def emit(self, record: logging.LogRecord) -> None:
+        try:
+            self._box.log_line(record)
+        except Exception:
+            self.handleError(record)
+
+
+def _boot_id() -> str:
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    except OSError:
+        return ""

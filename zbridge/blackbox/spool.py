@@ -1,0 +1,333 @@
+"""Writes the black box of one robot: all that touches the disk, and the decision what is kept. No thread, no loop.
+
+Theory of operation. :meth:`Spool.write` gets what came since the call before, in order: records, and orders between
+them. Records go to the current segment. A segment ends at :class:`NextSegment`, which brings what the next one begins
+with, or when it is large or old. Without an incident the next segment is made in the ring, whose oldest are deleted.
+
+:class:`Keep` begins an incident, unless one is open: the ring's segments are renamed into its folder, and further ones
+are made there until :data:`AFTER_S` after the last cause, but no longer than :attr:`Spool.longest_s`. Later causes join
+it. What follows has an incident of its own, which names the one with the minutes before.
+
+An OSError ends the segment; what was not written is counted, the next call tries again, and causes that could not be
+noted are kept for it. A full disk costs the oldest segment of the ring at each attempt. What the process before left
+open is continued.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from datetime import UTC, datetime
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from zbridge.blackbox.incidents import BoxFolder, IncidentCause, IncidentInfo, head_of, segments_of
+from zbridge.blackbox.segments import SUFFIX, Record, SegmentHead, head_block, record_blocks
+from zbridge.blackbox.settings import SEGMENT_S, BlackBoxSettings
+from zbridge.log import Log
+
+log = Log("zbridge.blackbox")
+
+AFTER_S = 60.0
+"""Seconds after the last cause that are kept."""
+SEGMENT_BYTES = 8 * 2**20
+"""A segment ends at this size."""
+PENDING = 64
+"""Causes that wait for a disk that fails."""
+FRAME = ("status", "control", "@rpc/sessions/gateway")
+"""Paths of the messages that ``incident.json`` shows."""
+_LATE = 1.5
+"""A segment that lasts so many times its time ends by itself: the event loop hangs."""
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+
+
+class NextSegment(msgspec.Struct, frozen=True):
+    """The next segment begins, with these records."""
+
+    records: Sequence[Record] = ()
+
+
+class Keep(msgspec.Struct, frozen=True):
+    """Something happened: keep the minutes before. Comes before a :class:`NextSegment` with the state of that moment.
+
+    died: it concerns the process before this one, so the minutes before its last segment are meant.
+    """
+
+    cause: IncidentCause
+    frame: Sequence[Record] = ()
+    died: bool = False
+
+
+Item = Record | NextSegment | Keep
+
+
+class Spool:
+    """The writer of one robot's folder.
+
+    head: describes a segment that begins now. counted: called with the code of each incident that begins, and with
+    ``removed`` for each that is deleted.
+    """
+
+    def __init__(
+        self,
+        folder: BoxFolder,
+        settings: BlackBoxSettings,
+        head: Callable[[], SegmentHead],
+        counted: Callable[[str], object] = lambda what: None,
+    ) -> None:
+        self.folder = folder
+        self.bytes = 0
+        """Written so far."""
+        self.unwritten = 0
+        """Records that the disk did not take."""
+        self.incident: IncidentInfo | None = None
+        """The one that is open."""
+        self.error: OSError | None = None
+        """Why the last attempt failed; None: it did not."""
+        self.longest_s = settings.minutes * 60 + AFTER_S
+        """Most seconds from the first cause of an incident to its end."""
+        self._settings = settings
+        self._head = head
+        self._counted = counted
+        self._life: int | None = None
+        self._number = 0
+        self._segment: int | None = None
+        """The descriptor of the current segment."""
+        self._path = folder.ring
+        self._size = 0
+        self._began = 0.0
+        self._incident_began = self._until = 0.0
+        self._last: str | None = None
+        """The incident before, while the ring lacks what it took."""
+        self._pending: deque[Keep] = deque(maxlen=PENDING)
+
+    def __repr__(self) -> str:
+        return f"<Spool {self.folder.path} {self._path.name}, incident {self.incident and self.incident.name}>"
+
+    def begin(self, now: float, wall_ns: int) -> list[int]:
+        """Begin; return the processes before this one that ended without taking leave. now: seconds. Raises OSError."""
+        self.folder.make()
+        self._number = self.folder.last_number()
+        dead = self.folder.dead()
+        self._life = self.folder.take_life()
+        for info in self.folder.infos():
+            if info.ended_ns is None:
+                self._continue(info, now, wall_ns)
+        return dead
+
+    def write(self, items: Iterable[Item], now: float) -> None:
+        """Write what came; never raises. ``error`` says whether the disk took it."""
+        self.error = None
+        for is_record, group in groupby(items, lambda item: type(item) is tuple):
+            if is_record:
+                self._attempt(self._write_records, group, now)
+                self.unwritten += sum(1 for _ in group)
+            else:
+                for order in group:
+                    self._take_order(order, now)  # type: ignore[arg-type]
+        if self._pending:
+            self._attempt(self._keep_pending, now)
+        if self.incident is not None and now >= min(self._until, self._incident_began + self.longest_s):
+            self._attempt(self._end_incident)
+
+    def close(self, *, handed_over: bool) -> None:
+        """End in order. handed_over: another process continues, also an incident that is open. Never raises."""
+        if self.incident is not None and not handed_over:
+            with contextlib.suppress(OSError):
+                self._end_incident()
+        self._end_segment()
+        if self._life is not None:
+            self.folder.end_life(self._life)
+            self._life = None
+
+    # Segments
+
+    def _attempt(self, work: Callable[..., None], *arguments: Any) -> None:
+        try:
+            work(*arguments)
+        except OSError as error:
+            self.error = error
+            self._end_segment()
+            if error.errno in _FULL:
+                with contextlib.suppress(OSError, IndexError):
+                    segments_of(self.folder.ring)[0].unlink()
+
+    def _take_order(self, order: NextSegment | Keep, now: float) -> None:
+        if isinstance(order, Keep):
+            self._pending.append(order)
+            self._attempt(self._keep_pending, now)
+        else:
+            self._end_segment()
+            self._attempt(self._write_records, order.records, now)
+
+    def _write_records(self, records: Iterable[Record], now: float) -> None:
+        if self._segment is not None and now - self._began >= _LATE * SEGMENT_S:
+            self._end_segment()
+        for count, block in record_blocks(records):
+            try:
+                if self._segment is None or self._size >= SEGMENT_BYTES:
+                    self._next_segment(now)
+                self._append(block)
+            except OSError:
+                self.unwritten += count
+                raise
+        if self._settings.fsync and self._segment is not None:
+            os.fdatasync(self._segment)
+
+    def _append(self, block: bytes) -> None:
+        """Write a block whole, or nothing of it."""
+        assert self._segment is not None
+        rest = memoryview(block)
+        try:
+            while rest:
+                rest = rest[os.write(self._segment, rest) :]
+        except OSError:
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._segment, self._size)
+            raise
+        self._size += len(block)
+        self.bytes += len(block)
+
+    def _next_segment(self, now: float) -> None:
+        self._end_segment()
+        folder = self.folder.ring if self.incident is None else self.folder.incidents / self.incident.name
+        for _ in range(100):  # another process, which hands over, may make some too
+            self._number += 1
+            path = folder / f"{self._number:010d}{SUFFIX}"
+            with contextlib.suppress(FileExistsError):
+                self._segment = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+                break
+        else:
+            raise OSError(errno.EEXIST, f"no free number after {self._number}")
+        self._path, self._size, self._began = path, 0, now
+        try:
+            self._append(head_block(self._head()))
+        except OSError:
+            path.unlink(missing_ok=True)
+            raise
+        if self._settings.fsync:
+            self._sync(folder)
+        if self.incident is None:
+            for old in segments_of(self.folder.ring)[: -self._settings.segments]:
+                old.unlink(missing_ok=True)
+
+    def _end_segment(self) -> None:
+        segment, self._segment = self._segment, None
+        if segment is not None:
+            with contextlib.suppress(OSError):
+                os.close(segment)
+
+    def _sync(self, folder: Path) -> None:
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+    # Incidents
+
+    def _keep_pending(self, now: float) -> None:
+        while self._pending:
+            self._keep(self._pending[0], now)
+            self._pending.popleft()
+
+    def _keep(self, order: Keep, now: float) -> None:
+        if self.incident is not None and now >= self._incident_began + self.longest_s:
+            self._end_incident()
+        if self.incident is None:
+            self._begin_incident(order, now)
+        else:
+            joined = self.incident.joined(order.cause)
+            if joined.more == self.incident.more:
+                self.folder.write_info(joined, fsync=self._settings.fsync)
+            self.incident = joined
+        self._until = now + AFTER_S
+
+    def _begin_incident(self, order: Keep, now: float) -> None:
+        self._end_segment()
+        folder, cause = self.folder, order.cause
+        fresh = self._fresh(order)
+        moment = datetime.fromtimestamp(cause.at_ns / 1e9, UTC)
+        name = unique = f"{moment:%Y%m%dT%H%M%SZ}-{_robot_of(folder)}-{cause.code}"
+        for copy in range(2, 1000):
+            if not (folder.incidents / unique).exists():
+                break
+            unique = f"{name}-{copy}"
+        realm, _, robot = folder.path.name.partition("@")
+        before = self._last if not fresh or len(fresh) < self._settings.segments - 1 else None
+        info = IncidentInfo(unique, realm, robot, self._number, (cause,), None, 0, before, self._frame(order.frame))
+        (folder.incidents / unique).mkdir(mode=0o700)
+        folder.write_info(info, fsync=self._settings.fsync)
+        self.incident, self._incident_began = info, now
+        self._counted(cause.code)
+        log.warning("incident", "kept as {name}: {reason}", name=unique, reason=cause.text, code=cause.code)
+        for segment in fresh:
+            segment.rename(folder.incidents / unique / segment.name)
+        if self._settings.fsync:
+            self._sync(folder.incidents / unique)
+        self._remove_surplus()
+
+    def _fresh(self, order: Keep) -> list[Path]:
+        """Return the segments of the ring that belong to the minutes before."""
+        ring = segments_of(self.folder.ring)
+        heads = {path: head_of(path) for path in ring}
+        reference: SegmentHead | None = self._head()
+        if order.died:
+            theirs = [head for head in heads.values() if head is not None and head.pid != os.getpid()]
+            reference = theirs[-1] if theirs else reference
+        most_s = (self._settings.segments + 1) * SEGMENT_S
+        return [path for path in ring if _age_s(heads[path], reference) <= most_s]
+
+    def _frame(self, records: Sequence[Record]) -> dict[str, Any]:
+        """Return what ``incident.json`` shows of the moment."""
+        head = self._head()
+        frame: dict[str, Any] = {"host": os.uname().nodename, "pid": head.pid, "lost": head.lost, **head.about}
+        for _, key, payload, _ in records:
+            path = key.split("/", 2)[2]
+            if path in FRAME:
+                with contextlib.suppress(msgspec.MsgspecError, UnicodeError):
+                    frame[path.removeprefix("@rpc/").partition("/")[0]] = msgspec.msgpack.decode(payload)
+        return frame
+
+    def _end_incident(self) -> None:
+        assert self.incident is not None
+        ended_ns = self._head().wall_ns
+        self.folder.write_info(msgspec.structs.replace(self.incident, ended_ns=ended_ns), fsync=self._settings.fsync)
+        self._last, self.incident = self.incident.name, None
+        self._end_segment()
+
+    def _continue(self, info: IncidentInfo, now: float, wall_ns: int) -> None:
+        """Continue an incident that the process before left open; end it if its time is over."""
+        segments = segments_of(self.folder.incidents / info.name)
+        since_s = (wall_ns - max(info.causes[-1].at_ns, info.began_ns)) / 1e9
+        self.incident, self._incident_began = info, now - min(max(since_s, 0.0), self.longest_s)
+        self._until = now + (AFTER_S - since_s if 0.0 <= since_s <= AFTER_S else 0.0)
+        if self._until <= now or not segments:
+            self._end_incident()
+
+    def _remove_surplus(self) -> None:
+        for name in self.folder.surplus(self._settings.keep):
+            if self.incident is None or name != self.incident.name:
+                self.folder.remove(name)
+                self._counted("removed")
+                keep = self._settings.keep
+                log.warning("incident_removed", "{name} was deleted: keep = {keep}", name=name, keep=keep)
+
+
+def _robot_of(folder: BoxFolder) -> str:
+    return folder.path.name.partition("@")[2]
+
+
+def _age_s(head: SegmentHead | None, reference: SegmentHead | None) -> float:
+    """Return how much older a segment is than another one; a damaged one counts as of the same time."""
+    if head is None or reference is None:
+        return 0.0
+    if head.boot == reference.boot:
+        return (reference.mono_ns - head.mono_ns) / 1e9
+    return (reference.wall_ns - head.wall_ns) / 1e9

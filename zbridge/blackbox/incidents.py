@@ -84,6 +84,8 @@ class BoxFolder:
     """The files of one robot below the folder of all black boxes."""
 
     def __init__(self, folder: Path, realm: str, robot: str) -> None:
+        self.realm = realm
+        self.robot = robot
         self.path = folder / f"{realm}@{robot}"
         self.ring = self.path / "ring"
         self.incidents = self.path / "incidents"

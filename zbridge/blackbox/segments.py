@@ -8,7 +8,7 @@ of kind ``R`` a list of records. A damaged block costs itself: the reader goes o
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from typing import Any
 from zlib import crc32
 
@@ -87,7 +87,7 @@ def record_blocks(records: Iterable[Record]) -> Iterator[tuple[int, bytes]]:
         yield len(waiting), _block(_RECORDS, _encode(waiting))
 
 
-def read_segment(data: bytes) -> Iterator[SegmentHead | Sequence[Record] | Damage]:
+def read_segment(data: bytes) -> Iterator[SegmentHead | list[Record] | Damage]:
     """Read the bytes of a segment, or of several one after the other; never raises."""
     at = good = 0
     while at < len(data):

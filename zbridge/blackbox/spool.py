@@ -19,7 +19,7 @@ import contextlib
 import errno
 import os
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 from itertools import groupby
 from pathlib import Path
@@ -28,7 +28,7 @@ from typing import Any
 import msgspec
 
 from zbridge.blackbox.incidents import BoxFolder, IncidentCause, IncidentInfo, head_of, segments_of
-from zbridge.blackbox.segments import SUFFIX, Record, SegmentHead, head_block, record_blocks
+from zbridge.blackbox.segments import SUFFIX, Record, SegmentHead, head_block, read_segment, record_blocks
 from zbridge.blackbox.settings import SEGMENT_S, BlackBoxSettings
 from zbridge.log import Log
 
@@ -254,14 +254,15 @@ class Spool:
         folder, cause = self.folder, order.cause
         fresh = self._fresh(order)
         moment = datetime.fromtimestamp(cause.at_ns / 1e9, UTC)
-        name = unique = f"{moment:%Y%m%dT%H%M%SZ}-{_robot_of(folder)}-{cause.code}"
+        name = unique = f"{moment:%Y%m%dT%H%M%SZ}-{folder.robot}-{cause.code}"
         for copy in range(2, 1000):
             if not (folder.incidents / unique).exists():
                 break
             unique = f"{name}-{copy}"
-        realm, _, robot = folder.path.name.partition("@")
         before = self._last if not fresh or len(fresh) < self._settings.segments - 1 else None
-        info = IncidentInfo(unique, realm, robot, self._number, (cause,), None, 0, before, self._frame(order.frame))
+        info = IncidentInfo(
+            unique, folder.realm, folder.robot, self._number, (cause,), None, 0, before, self._frame(order, fresh)
+        )
         (folder.incidents / unique).mkdir(mode=0o700)
         folder.write_info(info, fsync=self._settings.fsync)
         self.incident, self._incident_began = info, now
@@ -284,9 +285,15 @@ class Spool:
         most_s = (self._settings.segments + 1) * SEGMENT_S
         return [path for path in ring if _age_s(heads[path], reference) <= most_s]
 
-    def _frame(self, records: Sequence[Record]) -> dict[str, Any]:
-        """Return what ``incident.json`` shows of the moment."""
-        head = self._head()
+    def _frame(self, order: Keep, fresh: Sequence[Path]) -> dict[str, Any]:
+        """Return what ``incident.json`` shows of the moment: of a process that died, its last words."""
+        head, records = self._head(), order.frame
+        if order.died:
+            heads = ((path, head_of(path)) for path in fresh)
+            theirs = [(path, each) for path, each in heads if each is not None and each.pid != head.pid]
+            if theirs:
+                head = theirs[-1][1]
+                records = [record for path, _ in theirs[-2:] for record in _records_of(path)]
         frame: dict[str, Any] = {"host": os.uname().nodename, "pid": head.pid, "lost": head.lost, **head.about}
         for _, key, payload, _ in records:
             path = key.split("/", 2)[2]
@@ -320,8 +327,10 @@ class Spool:
                 log.warning("incident_removed", "{name} was deleted: keep = {keep}", name=name, keep=keep)
 
 
-def _robot_of(folder: BoxFolder) -> str:
-    return folder.path.name.partition("@")[2]
+def _records_of(segment: Path) -> Iterator[Record]:
+    for content in read_segment(segment.read_bytes()):
+        if isinstance(content, list):
+            yield from content
 
 
 def _age_s(head: SegmentHead | None, reference: SegmentHead | None) -> float:

@@ -11,6 +11,7 @@ import typer
 from zbridge.app import addressed, listener_template, robot_template, secured
 from zbridge.bus.tls.files import folder_tls
 from zbridge.cli import (
+    blackbox,
     certs,
     console,
     doctor,
@@ -41,6 +42,7 @@ app = typer.Typer(
 )
 app.add_typer(certs.app, name="certs")
 app.add_typer(console.app, name="console")
+app.add_typer(blackbox.app, name="blackbox")
 app.add_typer(robot_commands.app)
 app.add_typer(doctor.app)
 app.add_typer(recording_commands.app)

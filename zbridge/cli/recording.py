@@ -18,6 +18,7 @@ from zbridge.app import until_signal
 from zbridge.bus import BusSettings, read_key_expr
 from zbridge.bus.tls.files import own_name, own_role
 from zbridge.bus.tls.membership import Right, require_right
+from zbridge.cli.incidents import keep_minutes
 from zbridge.cli.terminal import Column, Table, console, errors
 from zbridge.client import joined
 from zbridge.client.driver import default_who
@@ -147,12 +148,16 @@ def _report_end(recorder: Recorder, tape: Tape, seconds: float) -> None:
         errors.print("nothing lost")
 
 
-async def put_mark(settings: BusSettings, realm: str, text: str, who: str | None) -> None:
-    """Put a mark on the bus; raise BusRefused for a role that may not: the router would silently drop it."""
+async def put_mark(settings: BusSettings, realm: str, text: str, who: str | None, *, keep: bool = False) -> bool:
+    """Put a mark on the bus; raise BusRefused for a role that may not: the router would silently drop it.
+
+    keep: let black boxes keep the minutes before; then return whether there is one.
+    """
     name, role = own_name(settings.tls), own_role(settings.tls)
     async with joined(settings, realm) as bus:
         await require_right(bus.ask, realm, name or default_who(), Right.MARK, role=role or "")
         await publish_mark(bus, realm, text, who or name or default_who())
+        return not keep or await keep_minutes(bus, realm, name or who or default_who(), text)
 
 
 def show_info(path: Path, *, as_json: bool) -> None:

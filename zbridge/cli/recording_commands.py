@@ -109,14 +109,20 @@ def mark(
     who: Annotated[
         str, typer.Option(help="author of the mark; by default the name in the certificate, else user@host")
     ] = "",
+    keep: Annotated[
+        bool, typer.Option("--keep", help="let all black boxes keep the minutes before now, and the one after it")
+    ] = False,
     connect: Connect = [],
     tls: TlsFolder = None,
     realm: Realm = "fleet",
 ) -> None:
-    """Write an event into all running recordings of the realm."""
+    """Write an event into all running recordings of the realm.
+
+    Exit code 1: with --keep, no gateway has a black box.
+    """
     from zbridge.cli.recording import put_mark
 
-    run_command(put_mark(bus_settings(connect, tls), realm, text, who or None))
+    run_command(put_mark(bus_settings(connect, tls), realm, text, who or None, keep=keep))
 
 
 @app.command()

@@ -206,6 +206,7 @@ def examine_robot(
     if entry.status is not None and not first.failed:
         rates = entry.stats.rates if entry.stats is not None else None
         yield from judge.judge_link(entry.status, rates, _advice(entry, tables), _last_reason(tables))
+        yield from judge.judge_faults(entry.status)
         yield from _judge_same_address(entry, model)
         if entry.control is not None and entry.status.state == "established":
             yield from judge.judge_driving(entry.control, entry.name)

@@ -126,6 +126,15 @@ def judge_link(
             yield ok(layer, f"established ({agreed}) at {peers}{features}{f'; {sends}' if sends else ''}")
 
 
+def judge_faults(status: Status) -> Iterator[Finding]:
+    """Judge the open faults that nothing else of the status tells."""
+    for fault in status.faults:
+        if fault.text not in (status.reason or "") and fault.code != Code.LATCHED:
+            times = "once" if fault.count == 1 else f"{fault.count} times"
+            text = f"{fault.code} {times} in the last minutes: {fault.text}"
+            yield warning(Layer.ROBOT, f"fault_{fault.code}", text, "what happened before: zbridge blackbox ls")
+
+
 def judge_driving(control: Control, robot: str) -> Iterator[Finding]:
     """Judge who drives, and what was refused since the gateway started."""
     layer = Layer.DRIVING

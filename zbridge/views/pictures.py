@@ -22,6 +22,7 @@ import msgspec
 import numpy as np
 from foxglove.messages import LogLevel
 
+from zbridge.blackbox.segments import LogLine
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, FleetMessage, Image, Map, Pose, Scan, Status, Text
 from zbridge.fleet.payload import measured_ns
@@ -57,6 +58,7 @@ _CELL_FIELDS = [
     fox.PackedElementField(name=name, offset=offset, type=_UINT8)
     for offset, name in enumerate(("red", "green", "blue", "alpha"))
 ]
+_LINE_LEVELS = {"debug": LogLevel.Debug, "info": LogLevel.Info, "warning": LogLevel.Warning}
 _LEVELS = {"debug": LogLevel.Debug, "chat": LogLevel.Info, "request": LogLevel.Info}
 
 
@@ -104,11 +106,20 @@ def sources_of(channel: ViewerChannel) -> tuple[str, ...]:
     return also.sources if also is not None else (channel.path,)
 
 
+def line_picture(robot: str, line: LogLine, now_ns: int) -> Picture:
+    """Draw a line of a gateway's log on the robot's log."""
+    channel = next(each for each in channels_of(robot, topics.TEXT.path) if each.path == "log")
+    level = _LINE_LEVELS.get(line.level, LogLevel.Error)
+    stamp_ns = measured_ns(line.stamp_ns, now_ns, _END_NS)
+    return Picture(channel, log(line.message, level, line.logger, stamp_ns), stamp_ns)
+
+
 class FoxglovePictures:
     """Draws what one robot publishes. It keeps what the trail, the frames and the log need, and nothing else."""
 
     def __init__(self, robot: str) -> None:
         self.robot = robot
+        self._faults: set[tuple[str, int]] = set()
         self._frame = {name: f"{robot}/{name}" for name in ("map", "base", "scan")}
         self._trail: deque[tuple[float, float]] = deque(maxlen=TRAIL_POINTS)
         self._trail_drawn_ns = self._frames_sent_ns = -_END_NS
@@ -159,6 +170,13 @@ class FoxglovePictures:
             self._trail_drawn_ns = stamp_ns
             yield trail(self._trail, self._frame["map"], stamp_ns)
 
+    def _fault_lines(self, status: Status, stamp_ns: int) -> Iterator[bytes]:
+        """Write faults that have opened."""
+        known, self._faults = self._faults, {(fault.code, fault.since_ns) for fault in status.faults}
+        for fault in status.faults:
+            if (fault.code, fault.since_ns) not in known:
+                yield log(f"fault {fault.code}: {fault.text}", LogLevel.Error, self.robot, stamp_ns)
+
     def _logged(self, message: FleetMessage, stamp_ns: int) -> Iterator[bytes]:
         """Write texts, changes of the robot's state, and refusals that are new."""
         if isinstance(message, Text):
@@ -168,6 +186,9 @@ class FoxglovePictures:
             level = LogLevel.Info if message.state == "established" else LogLevel.Warning
             text = message.state + (f": {message.reason}" if message.reason else "")
             yield log(text, level, self.robot, stamp_ns)
+            yield from self._fault_lines(message, stamp_ns)
+        elif isinstance(message, Status):
+            yield from self._fault_lines(message, stamp_ns)
         elif isinstance(message, Control):
             for refusal in self._news.take(message):
                 text = f"{refusal.command} of {refusal.who or 'somebody'} refused: {refusal.reason} ({refusal.count})"

@@ -152,7 +152,9 @@ def _reason(entry: RobotEntry, state: RowState) -> str:
         RowState.UNKNOWN: "" if entry.status is not None else "the gateway has published no status yet",
     }.get(state, "")
     reported = entry.status.reason or "" if entry.status is not None and state is not RowState.NO_GATEWAY else ""
-    return shown("; ".join(filter(None, (own, entry.stopped_by, reported))), _CELL)
+    faults = entry.status.faults if entry.status is not None and state is not RowState.NO_GATEWAY else ()
+    more = (f"{fault.code}: {fault.text}" for fault in faults if fault.text not in reported)
+    return shown("; ".join(filter(None, (own, entry.stopped_by, reported, *more))), _CELL)
 
 
 def _host(entry: RobotEntry) -> str:
@@ -186,6 +188,7 @@ def as_fields(row: RobotRow, entry: RobotEntry) -> dict[str, Any]:
         "control": control.state if control is not None else None,
         "driver": entry.driver or None,
         "latches": [latch.described for latch in control.latches] if control is not None else [],
+        "faults": msgspec.to_builtins(status.faults) if status is not None else [],
         "refusals": msgspec.to_builtins(control.refusals) if control is not None else [],
         "protocol": status.protocol if status is not None else None,
         "version": status.version if status is not None else None,

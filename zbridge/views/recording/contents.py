@@ -8,6 +8,7 @@ The topic is the Zenoh key. A fleet message is recorded as it was, encoding ``ms
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Iterator
 from functools import lru_cache
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from zbridge.blackbox.segments import LOG, LogLine
 from zbridge.errors import ConfigError, PayloadError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -73,8 +75,15 @@ def message_of(key: str) -> type[FleetMessage] | None:
         return Alive
     if path.startswith("@rpc/sessions/"):
         return Sessions
+    if path == LOG:
+        return LogLine
     topic = topics.find(path)
     return topic.message if topic is not None and not path.startswith("@rpc/") else None
+
+
+def is_log(key: str) -> bool:
+    """Return whether a key has lines of a gateway's log, from its black box."""
+    return key.endswith(f"/{LOG}")
 
 
 def is_wire(key: str) -> bool:
@@ -146,6 +155,16 @@ class Pictures:
             return
         for picture in robot.draw(topic, message, now_ns):
             yield _drawn_on(picture.channel), picture.stamp_ns, picture.payload
+
+    def draw_line(self, key: str, payload: bytes, now_ns: int) -> Iterator[tuple[ChannelKind, bytes]]:
+        """Yield the picture of a log line: channel, payload."""
+        from zbridge.views.pictures import line_picture
+
+        split = split_key(key)
+        if split is not None:
+            with contextlib.suppress(PayloadError):
+                picture = line_picture(split[1], payloads.decode(LogLine, payload), now_ns)
+                yield _drawn_on(picture.channel), picture.payload
 
 
 @lru_cache(maxsize=ROBOTS * 16)

@@ -27,8 +27,9 @@ class Diagnostic(msgspec.Struct, frozen=True):
 
 
 def entries_of(robot: str, status: Status | None, control: Control | None) -> list[Diagnostic]:
-    """Return the entries of a robot's state, links, control and refusals, as its gateway reports them."""
-    return [_state(robot, status), _links(robot, status), _control(robot, control), _refusals(robot, control)]
+    """Return the entries of a robot's state, links, faults, control and refusals, as its gateway reports them."""
+    state = [_state(robot, status), _links(robot, status), _faults(robot, status)]
+    return [*state, _control(robot, control), _refusals(robot, control)]
 
 
 def _state(robot: str, status: Status | None) -> Diagnostic:
@@ -41,6 +42,14 @@ def _state(robot: str, status: Status | None) -> Diagnostic:
         values.append(("features", ", ".join(status.features)))
     text = status.state + (f": {status.reason}" if status.reason else "")
     return Diagnostic(_UNUSABLE.get(status.state, ERROR), name, cut(text), values)
+
+
+def _faults(robot: str, status: Status | None) -> Diagnostic:
+    name, faults = f"{robot}: faults", status.faults if status is not None else ()
+    if not faults:
+        return Diagnostic(STALE if status is None else OK, name, "no gateway reports" if status is None else "none")
+    values = [(fault.code, cut(f"{fault.text} ({fault.count})")) for fault in faults[:MOST_VALUES]]
+    return Diagnostic(WARN, name, cut(", ".join(fault.code for fault in faults)), values)
 
 
 def _links(robot: str, status: Status | None) -> Diagnostic:

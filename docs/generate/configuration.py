@@ -11,6 +11,7 @@ from msgspec import inspect
 from docs.generate.declared import fields, meanings, summary, table
 from zbridge.app.config import LogSettings, MetricsSettings, RobotSettings
 from zbridge.app.templates import listener_template, robot_template
+from zbridge.blackbox import BlackBoxSettings
 from zbridge.bus import BusSettings, Tls
 from zbridge.camera.settings import CameraSettings
 from zbridge.control.settings import ControlSettings
@@ -103,7 +104,7 @@ def robot_file() -> str:
     parts = (
         ("[robot]", RobotSettings), ("[device]", DeviceSettings), ("[[hq]]", HqSettings), ("[hq.tls]", ListenerTls),
         ("[camera]", CameraSettings), ("[bus]", BusSettings), ("[bus.tls]", Tls), ("[control]", ControlSettings),
-        ("[metrics]", MetricsSettings), ("[log]", LogSettings),
+        ("[metrics]", MetricsSettings), ("[log]", LogSettings), ("[blackbox]", BlackBoxSettings),
     )  # fmt: skip
     return "\n".join(settings(name, struct, told) for name, struct in parts)
 
@@ -118,7 +119,12 @@ def sections() -> dict[str, str]:
         "options": "\n".join(options(find_protocol(name)) for name in protocol_names()),
         "host file": "\n".join(
             settings(name, struct, host)
-            for name, struct in (("[host]", HostSettings), ("[metrics]", MetricsSettings), ("[log]", LogSettings))
+            for name, struct in (
+                ("[host]", HostSettings),
+                ("[metrics]", MetricsSettings),
+                ("[log]", LogSettings),
+                ("[blackbox]", BlackBoxSettings),
+            )
         ),
         "router file": settings("router.toml", RouterSettings, router).replace("`[router.", "`["),
         "ros2 file": settings("ros2.toml", Ros2Settings, {}).replace("`[ros2.", "`["),

@@ -55,6 +55,14 @@ LOG_TEMPLATE = """
 # format = "console"                    # lines for people; "json": one object a line, for programs
 # level = "info"                        # the least that is written: debug, info, warning, error
 """
+BLACKBOX_TEMPLATE = """
+[blackbox]                              # the last minutes on disk, kept after an incident: docs/how-to/blackbox.md
+minutes = 5.0                           # before a cause; the page says how much is written a day
+keep = 20                               # incidents; older ones are deleted
+# dir = "/var/lib/zbridge/blackbox"     # may be in memory (tmpfs), for hosts with an SD card; left out: blackbox
+                                        # in $STATE_DIRECTORY, or in ~/.local/state/zbridge
+# fsync = true                          # wait for the disk each second, so that lost power costs 2 s at most
+"""
 LISTENER_TEMPLATE = """\
 # name = "desk"                         # of the listener on the bus; left out: from its protocol and the process
 clients = 256                           # most at a time; further ones are refused
@@ -129,4 +137,5 @@ audit_days = 30.0                       # further ones are kept until they are s
 """
     + METRICS_TEMPLATE
     + LOG_TEMPLATE
+    + BLACKBOX_TEMPLATE
 )

@@ -13,6 +13,9 @@ from zbridge.blackbox.segments import Damage, Record, SegmentHead, read_segment
 from zbridge.errors import Unsupported
 from zbridge.fleet.incidents import FILES, PART_BYTES, IncidentEntry, IncidentPart, Incidents, ReadIncident
 
+_STEP_NS = 100_000_000
+"""A smaller step of the clock is not told."""
+
 
 class KeptRecord(msgspec.Struct, frozen=True):
     """One message of an incident. at_ns: when it came, Unix time; it rises also where the clock was set back."""
@@ -80,7 +83,8 @@ def read_records(segments: list[Path], findings: Findings) -> Iterator[KeptRecor
                 lost[content.pid] = content.lost
                 found_ns = content.wall_ns - content.mono_ns
                 if boot == content.boot and found_ns < offset_ns:
-                    findings.set_back_s = max(findings.set_back_s, (offset_ns - found_ns) / 1e9)
+                    if offset_ns - found_ns > _STEP_NS:
+                        findings.set_back_s = max(findings.set_back_s, (offset_ns - found_ns) / 1e9)
                     found_ns = offset_ns
                 boot, offset_ns = content.boot, found_ns
             else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import tempfile
 from collections.abc import Sequence
 from datetime import datetime
@@ -13,7 +14,7 @@ import msgspec
 from zbridge.blackbox.incidents import INFO, BoxFolder, IncidentInfo, boxes, is_incident_name
 from zbridge.blackbox.reading import Findings, list_incidents, read_records
 from zbridge.blackbox.segments import LogLine
-from zbridge.bus import Bus, BusSettings
+from zbridge.bus import Answer, Bus, BusSettings
 from zbridge.bus.tls.files import own_name, own_role
 from zbridge.bus.tls.membership import Right, require_right
 from zbridge.cli.terminal import Column, Table, console, errors
@@ -287,17 +288,19 @@ class IncidentReader:
 
 async def keep_minutes(bus: Bus, realm: str, who: str, text: str) -> bool:
     """Let all black boxes keep the minutes before now, and print whose did; False if there is none."""
-    question = payloads.encode(Text(text, "chat", who))
-    answers = await bus.ask(f"{realm}/*/{topics.RPC_INCIDENT_KEEP(who).path}", question, timeout_s=LIST_S)
-    kept = []
-    for answer in answers:
-        split = split_key(answer.key)
-        robot = split[1] if split is not None else answer.key
-        if answer.error is None:
-            kept.append(robot)
-        else:
-            errors.print(shown(f"{robot}: {answer.error}"))
-    console.print(shown(f"kept: {', '.join(sorted(kept))}" if kept else "no gateway has a black box"))
+    question, path = payloads.encode(Text(text, "chat", who)), topics.RPC_INCIDENT_KEEP(who).path
+
+    async def ask(robot: str) -> list[Answer]:
+        return await bus.ask(KeySpace(realm, robot).key(path), question, timeout_s=LIST_S)
+
+    tokens = await bus.alive(f"{realm}/*/@alive/gateway")
+    robots = sorted({split[1] for key in tokens if (split := split_key(key))})
+    found = dict(zip(robots, await asyncio.gather(*map(ask, robots)), strict=True))
+    for robot, answers in found.items():
+        for error in filter(None, (answer.error for answer in answers)):
+            errors.print(shown(f"{robot}: {error}"))
+    kept = [robot for robot, answers in found.items() if any(answer.error is None for answer in answers)]
+    console.print(shown(f"kept: {', '.join(kept)}" if kept else "no gateway has a black box"))
     return bool(kept)
 
 

@@ -6,7 +6,7 @@ import re
 import sys
 from pathlib import Path
 
-from docs.generate import alerts, bus, command_line, configuration, events, metrics
+from docs.generate import alerts, bus, command_line, configuration, events, faults, metrics
 
 DOCS = Path(__file__).parents[1]
 PART = re.compile(r"(<!-- generated: ([^>]+) -->\n).*?(<!-- /generated -->)", re.DOTALL)
@@ -14,7 +14,7 @@ PART = re.compile(r"(<!-- generated: ([^>]+) -->\n).*?(<!-- /generated -->)", re
 
 def generated() -> dict[str, str]:
     """Return every generated part by its name."""
-    parts = (alerts, bus, configuration, command_line, events, metrics)
+    parts = (alerts, bus, configuration, command_line, events, faults, metrics)
     return {name: text for part in parts for name, text in part.sections().items()}
 
 

@@ -10,7 +10,7 @@ from types import ModuleType
 import msgspec
 
 from docs.generate.declared import documented, fields, summary, table
-from zbridge.fleet import lease_messages, messages, processes, topics
+from zbridge.fleet import incidents, lease_messages, messages, processes, topics
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import QOS, Delivery, Topic
 
@@ -89,5 +89,6 @@ def sections() -> dict[str, str]:
         "delivery": qualities(),
         "messages": structs(messages),
         "lease messages": structs(lease_messages),
+        "incident messages": structs(incidents),
         "processes": structs(processes),
     }

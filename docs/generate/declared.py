@@ -9,13 +9,16 @@ import ast
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from enum import Enum
+from inspect import getsource
 from itertools import pairwise
 from typing import Any
 
 import msgspec
 from msgspec import UNSET, inspect
 
-from zbridge.fleet.messages import Device, FleetMessage, Latch, LinkStatus, Refusal
+from zbridge.fleet.incidents import IncidentEntry
+from zbridge.fleet.messages import Device, Fault, FleetMessage, Latch, LinkStatus, Refusal
 from zbridge.fleet.processes import DiskSpace, ListenerStats, ProcessStats, SessionEntry
 from zbridge.toml import as_toml
 
@@ -25,7 +28,18 @@ UNITS = {
     "deg": "degrees", "days": "days", "mps": "m/s", "radps": "rad/s", "rad": "radians", "m_s": "m/s", "rad_s": "rad/s",
     "m_s2": "m/s2", "per_s": "a second",
 }  # fmt: skip
-PARTS = Device | Latch | LinkStatus | Refusal | DiskSpace | ListenerStats | ProcessStats | SessionEntry
+PARTS = (
+    Device
+    | Fault
+    | Latch
+    | LinkStatus
+    | Refusal
+    | DiskSpace
+    | ListenerStats
+    | ProcessStats
+    | SessionEntry
+    | IncidentEntry
+)
 """Parts of messages, which have a heading of their own."""
 FAR = 1e9
 """A bound so far away only keeps out what is no number."""
@@ -82,6 +96,15 @@ def meanings(struct: type[msgspec.Struct]) -> dict[str, str]:
             for names, text in zip(parts[::2], parts[1::2], strict=True):
                 told |= dict.fromkeys(names.split(", "), text.strip(" .;,"))
     return told
+
+
+def members(enum: type[Enum]) -> Iterator[tuple[str, str]]:
+    """Yield each member of an enum, and the text below it."""
+    (declared,) = ast.parse(getsource(enum)).body
+    assert isinstance(declared, ast.ClassDef)
+    for member, text in pairwise(declared.body):
+        if isinstance(member, ast.Assign) and isinstance(text, ast.Expr):
+            yield ast.literal_eval(member.value), ast.literal_eval(text.value)
 
 
 def summary(struct: type[Any]) -> str:

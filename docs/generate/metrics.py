@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import ast
-import inspect
 from collections.abc import Iterator
-from itertools import pairwise
 from pathlib import Path
 
-from docs.generate.declared import table
+from docs.generate.declared import members, table
 from zbridge.control.events import StopCause
 from zbridge.metrics.families import GROUPS, Family, MetricKind
 from zbridge.protocol.plugin import protocol_names
@@ -19,17 +17,8 @@ GATEWAYS = Path(__file__).parents[2] / "gateways"
 def sections() -> dict[str, str]:
     """Write a table for each group of metrics."""
     parts = {f"metrics: {group}": _rows(families) for group, families in GROUPS.items()}
-    causes = table(("cause", "meaning"), [(f"`{cause}`", text.rstrip(".")) for cause, text in causes_of_stops()])
+    causes = table(("cause", "meaning"), [(f"`{cause}`", text.rstrip(".")) for cause, text in members(StopCause)])
     return parts | {"metrics: Protocols": _rows(tuple(of_protocols())), "metrics: causes of stops": causes}
-
-
-def causes_of_stops() -> Iterator[tuple[str, str]]:
-    """Give each cause of a stop, and the text below it."""
-    (declared,) = ast.parse(inspect.getsource(StopCause)).body
-    assert isinstance(declared, ast.ClassDef)
-    for member, text in pairwise(declared.body):
-        if isinstance(member, ast.Assign) and isinstance(text, ast.Expr):
-            yield _text(member.value), _text(text.value)
 
 
 def of_protocols() -> Iterator[Family]:

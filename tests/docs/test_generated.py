@@ -9,7 +9,8 @@ import pytest
 
 from docs.generate.__main__ import DOCS, PART, generated, rewritten
 from docs.generate.bus import declared
-from docs.generate.metrics import causes_of_stops, of_protocols
+from docs.generate.declared import members
+from docs.generate.metrics import of_protocols
 from zbridge.control.events import StopCause
 from zbridge.metrics.families import FAMILIES
 
@@ -51,4 +52,4 @@ def test_every_metric_that_a_page_names_exists(page: Path) -> None:
 
 
 def test_every_cause_of_a_stop_is_explained() -> None:
-    assert [cause for cause, _ in causes_of_stops()] == [cause.value for cause in StopCause]
+    assert [cause for cause, _ in members(StopCause)] == [cause.value for cause in StopCause]

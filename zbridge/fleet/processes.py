@@ -79,7 +79,7 @@ class ListenerStats(msgspec.Struct, frozen=True):
 class DiskSpace(msgspec.Struct, frozen=True):
     """The disk that a file is written to.
 
-    use: ``audit``, ``latches`` or ``recording``. path: of the file. free_bytes: left for this user.
+    use: ``audit``, ``blackbox``, ``latches`` or ``recording``. path: of the file. free_bytes: left for this user.
     """
 
     use: str

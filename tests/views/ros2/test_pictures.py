@@ -14,6 +14,7 @@ from zbridge.fleet.messages import (
     Battery,
     Control,
     Device,
+    Fault,
     Image,
     Latch,
     Map,
@@ -271,13 +272,17 @@ def test_sensors_and_the_camera_have_the_frames_of_their_messages_where_it_is_kn
 def test_diagnostics_tell_state_links_control_and_refusals() -> None:
     pictures = robot()
     before = {entry.name: entry.level for entry in cdr(pictures.diagnostics([], NOW_NS)).status}
-    assert before == {"r1: state": 3, "r1: links": 3, "r1: control": 3, "r1: refusals": 0}
+    assert before == {"r1: state": 3, "r1: links": 3, "r1: faults": 3, "r1: control": 3, "r1: refusals": 0}
     list(pictures.make("status", Status("connecting", "refused\x07", protocol="alf"), NOW_NS, ()))
+    assert {e.message for e in cdr(pictures.diagnostics([], NOW_NS)).status if e.name == "r1: faults"} == {"none"}
+    fault = Fault("deadman", "no command for 0.5 s (ann)", NOW_NS, 2)
+    list(pictures.make("status", Status("connecting", "refused\x07", protocol="alf", faults=(fault,)), NOW_NS, ()))
     refusal = Refusal(who="op1", command="drive", code="held", reason="held by op2", count=3)
     list(pictures.make("control", Control("held", "op2", refusals=(refusal,)), NOW_NS, ()))
     told = cdr(pictures.diagnostics([], NOW_NS))
     shown = {entry.name: (entry.level, entry.message, {v.key: v.value for v in entry.values}) for entry in told.status}
     assert shown["r1: state"] == (1, "connecting: refused?", {"protocol": "alf"})
+    assert shown["r1: faults"] == (1, "deadman", {"deadman": "no command for 0.5 s (ann) (2)"})
     assert shown["r1: control"] == (0, "held by op2", {"holder": "op2"})
     assert shown["r1: refusals"] == (1, "3 commands refused lately", {"drive of op1": "held by op2 (3)"})
     assert stamp(told.header) == NOW_NS

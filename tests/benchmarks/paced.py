@@ -184,7 +184,7 @@ def _lane(stack: contextlib.ExitStack, kind: Kind, route: Route, folder: Path) -
             tested = start(f"{_PACKAGE}.{SCRIPTS[kind]}", port, endpoint)
         else:
             file = folder / "gateway.toml"
-            file.write_text(_configuration(kind, port, endpoint))
+            file.write_text(configuration(kind, port, endpoint))
             tested = start("zbridge", "run", file)
     start_s = (sink.hear()["first_ns"] - tested.started_ns) / 1e9
     source.say("hold")
@@ -192,7 +192,7 @@ def _lane(stack: contextlib.ExitStack, kind: Kind, route: Route, folder: Path) -
     return Lane(source, tested, sink, start_s)
 
 
-def _configuration(kind: Kind, port: int, endpoint: str) -> str:
+def configuration(kind: Kind, port: int, endpoint: str) -> str:
     return f"""
 [robot]
 name = "{ROBOT}"

@@ -87,6 +87,7 @@ def exchanges(console: str) -> Iterator[tuple[str, str]]:
 
 _MASKS = (
     (r"\b\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d)?(\.\d+)?)?( ?UTC|Z)?", "DATE"),
+    (r"\b\d{8}T\d{6}Z", "DATE"),  # in the name of an incident
     (r"\b\d\d:\d\d(:\d\d)?(\.\d+)?\b", "TIME"),
     (r"\b[0-9a-f]{8,}\b|\b\d{10,}\b", "ID"),
     (r"\b(process|pid|PID) \d+", r"\1 N"),

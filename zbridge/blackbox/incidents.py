@@ -171,7 +171,11 @@ class BoxFolder:
         """Lock a file that shows that this process writes; return its descriptor."""
         path = self.live / str(os.getpid())
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(descriptor)
+            raise
         return descriptor
 
     def end_life(self, descriptor: int) -> None:

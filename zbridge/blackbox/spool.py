@@ -96,6 +96,8 @@ class Spool:
         self._head = head
         self._counted = counted
         self._life: int | None = None
+        self._dead: list[int] = []
+        """Of :meth:`begin`, which may fail and be called again."""
         self._number = 0
         self._segment: int | None = None
         """The descriptor of the current segment."""
@@ -114,12 +116,13 @@ class Spool:
         """Begin; return the processes before this one that ended without taking leave. now: seconds. Raises OSError."""
         self.folder.make()
         self._number = self.folder.last_number()
-        dead = self.folder.dead()
-        self._life = self.folder.take_life()
+        self._dead += self.folder.dead()
+        if self._life is None:
+            self._life = self.folder.take_life()
         for info in self.folder.infos():
             if info.ended_ns is None:
                 self._continue(info, now, wall_ns)
-        return dead
+        return self._dead
 
     def write(self, items: Iterable[Item], now: float) -> None:
         """Write what came; never raises. ``error`` says whether the disk took it."""

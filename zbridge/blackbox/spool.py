@@ -267,7 +267,12 @@ class Spool:
             unique, folder.realm, folder.robot, self._number, (cause,), None, 0, before, self._frame(order, fresh)
         )
         (folder.incidents / unique).mkdir(mode=0o700)
-        folder.write_info(info, fsync=self._settings.fsync)
+        try:
+            folder.write_info(info, fsync=self._settings.fsync)
+        except OSError:
+            with contextlib.suppress(OSError):
+                (folder.incidents / unique).rmdir()
+            raise
         self.incident, self._incident_began = info, now
         self._counted(cause.code)
         log.warning("incident", "kept as {name}: {reason}", name=unique, reason=cause.text, code=cause.code)

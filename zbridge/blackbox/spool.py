@@ -157,9 +157,17 @@ class Spool:
         except OSError as error:
             self.error = error
             self._end_segment()
-            if error.errno in _FULL:
-                with contextlib.suppress(OSError, IndexError):
+            with contextlib.suppress(OSError, IndexError):
+                if error.errno in _FULL:
                     segments_of(self.folder.ring)[0].unlink()
+                elif error.errno == errno.ENOENT:
+                    self._restore()
+
+    def _restore(self) -> None:
+        """Make folders that somebody deleted, and forget an incident that was."""
+        self.folder.make()
+        if self.incident is not None and not (self.folder.incidents / self.incident.name).exists():
+            self.incident = None
 
     def _take_order(self, order: NextSegment | Keep, now: float) -> None:
         if isinstance(order, Keep):

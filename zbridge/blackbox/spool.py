@@ -327,11 +327,14 @@ class Spool:
 
     def _continue(self, info: IncidentInfo, now: float, wall_ns: int) -> None:
         """Continue an incident that the process before left open; end it if its time is over."""
+        if self.incident is not None:
+            self._end_incident()
         segments = segments_of(self.folder.incidents / info.name)
+        began_s = (wall_ns - info.began_ns) / 1e9
         since_s = (wall_ns - max(info.causes[-1].at_ns, info.began_ns)) / 1e9
-        self.incident, self._incident_began = info, now - min(max(since_s, 0.0), self.longest_s)
+        self.incident, self._incident_began = info, now - max(began_s, 0.0)
         self._until = now + (AFTER_S - since_s if 0.0 <= since_s <= AFTER_S else 0.0)
-        if self._until <= now or not segments:
+        if self._until <= now or began_s >= self.longest_s or not segments:
             self._end_incident()
 
     def _remove_surplus(self) -> None:

@@ -80,6 +80,8 @@ def read_records(segments: list[Path], findings: Findings) -> Iterator[KeptRecor
                 findings.damaged += content.size
             elif isinstance(content, SegmentHead):
                 findings.heads.append(content)
+                before = lost.get(content.pid, content.lost)
+                findings.lost += content.lost - before if content.lost >= before else content.lost
                 lost[content.pid] = content.lost
                 found_ns = content.wall_ns - content.mono_ns
                 if boot == content.boot and found_ns < offset_ns:
@@ -90,8 +92,6 @@ def read_records(segments: list[Path], findings: Findings) -> Iterator[KeptRecor
             else:
                 findings.records += len(content)
                 yield from (_kept(record, offset_ns) for record in content)
-    first = {head.pid: head.lost for head in reversed(findings.heads)}
-    findings.lost = sum(count - first[pid] for pid, count in lost.items())
 
 
 def _kept(record: Record, offset_ns: int) -> KeptRecord:

@@ -27,7 +27,7 @@ from typing import Any
 
 import msgspec
 
-from zbridge.blackbox.incidents import BoxFolder, IncidentCause, IncidentInfo, head_of, segments_of
+from zbridge.blackbox.incidents import BoxFolder, IncidentCause, IncidentInfo, head_of, number_of, segments_of
 from zbridge.blackbox.segments import SUFFIX, Record, SegmentHead, head_block, read_segment, record_blocks
 from zbridge.blackbox.settings import SEGMENT_S, BlackBoxSettings
 from zbridge.log import Log
@@ -99,6 +99,8 @@ class Spool:
         self._dead: list[int] = []
         """Of :meth:`begin`, which may fail and be called again."""
         self._number = 0
+        self._before = 0
+        """Segments up to this number are of processes before this one; its id may be the same in a container."""
         self._segment: int | None = None
         """The descriptor of the current segment."""
         self._path = folder.ring
@@ -115,7 +117,7 @@ class Spool:
     def begin(self, now: float, wall_ns: int) -> list[int]:
         """Begin; return the processes before this one that ended without taking leave. now: seconds. Raises OSError."""
         self.folder.make()
-        self._number = self.folder.last_number()
+        self._number = self._before = self.folder.last_number()
         self._dead += self.folder.dead()
         if self._life is None:
             self._life = self.folder.take_life()
@@ -296,7 +298,7 @@ class Spool:
         heads = {path: head_of(path) for path in ring}
         reference: SegmentHead | None = self._head()
         if order.died:
-            theirs = [head for head in heads.values() if head is not None and head.pid != os.getpid()]
+            theirs = [head for path, head in heads.items() if head is not None and number_of(path) <= self._before]
             reference = theirs[-1] if theirs else reference
         most_s = (self._settings.segments + 1) * SEGMENT_S
         return [path for path in ring if _age_s(heads[path], reference) <= most_s]
@@ -305,14 +307,14 @@ class Spool:
         """Return what ``incident.json`` shows of the moment: of a process that died, its last words."""
         head, records = self._head(), order.frame
         if order.died:
-            heads = ((path, head_of(path)) for path in fresh)
-            theirs = [(path, each) for path, each in heads if each is not None and each.pid != head.pid]
+            heads = ((path, head_of(path)) for path in fresh if number_of(path) <= self._before)
+            theirs = [(path, each) for path, each in heads if each is not None]
             if theirs:
                 head = theirs[-1][1]
                 records = [record for path, _ in theirs[-2:] for record in _records_of(path)]
         frame: dict[str, Any] = {"host": os.uname().nodename, "pid": head.pid, "lost": head.lost, **head.about}
         for _, key, payload, _ in records:
-            path = key.split("/", 2)[2]
+            path = key.split("/", 2)[-1]
             if path in FRAME:
                 with contextlib.suppress(msgspec.MsgspecError, UnicodeError):
                     frame[path.removeprefix("@rpc/").partition("/")[0]] = msgspec.msgpack.decode(payload)

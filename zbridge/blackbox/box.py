@@ -35,6 +35,10 @@ RECORD_BYTES = 150
 """What a message costs in memory besides its payload, about."""
 WAKE_BYTES = QUEUE_BYTES // 3
 """The thread begins at once when so much waits."""
+ORDERS = 64
+"""Orders that may wait."""
+STATES = 8
+"""No order with all states is added to so many that wait."""
 LINES = 500
 """Log lines that may wait."""
 LINE_CHARACTERS = 2000
@@ -90,8 +94,9 @@ class BlackBox:
         self._waiting: deque[Item] = deque()
         self._lines: deque[Record] = deque(maxlen=LINES)
         self._put_bytes = self._taken_bytes = 0
+        self._put_orders = self._taken_orders = 0
         self._full = 0
-        """Messages that found no room."""
+        """Messages and causes that found no room."""
         self._segments = 0
         self._repeated: dict[str, int] = {}
         """The segment in which a large state was repeated last."""
@@ -169,7 +174,7 @@ class BlackBox:
         if not self._begun or now - self._kept_at.get(code, 0.0) < KEEP_S:
             return
         self._kept_at[code] = now
-        if now - self._framed_at < FRAME_S:
+        if now - self._framed_at < FRAME_S or self._put_orders - self._taken_orders >= STATES:
             self._order(Keep(cause, died=died))
             return
         self._framed_at, frame = now, self._records(self.snapshot())
@@ -177,6 +182,10 @@ class BlackBox:
         self._order(NextSegment(frame))
 
     def _order(self, order: Keep | NextSegment) -> None:
+        if self._put_orders - self._taken_orders >= ORDERS:
+            self._full += 1
+            return
+        self._put_orders += 1
         self._put_bytes += RECORD_BYTES
         self._waiting.append(order)
 
@@ -199,7 +208,7 @@ class BlackBox:
         if now - self._worked_at > STUCK_S:
             self._report(f"the black box is not written: the disk has not answered for {now - self._worked_at:.0f} s")
         self._segments += 1
-        if self._put_bytes - self._taken_bytes <= QUEUE_BYTES:
+        if self._put_bytes - self._taken_bytes <= QUEUE_BYTES and self._put_orders - self._taken_orders < STATES:
             self._order(NextSegment(self._records(filter(self._is_due, self.snapshot()))))
 
     def _is_due(self, state: tuple[str, bytes]) -> bool:
@@ -242,6 +251,7 @@ class BlackBox:
         items = [self._waiting.popleft() for _ in range(len(self._waiting))]
         spool.write(lines + items, now)
         self._taken_bytes += sum(RECORD_BYTES + (len(item[2]) if type(item) is tuple else 0) for item in items)
+        self._taken_orders += sum(1 for item in items if type(item) is not tuple)
         self._worked_at = time.monotonic()
         error = error or spool.error
         text = f"the black box is not written: {self.folder.path}: {error.strerror or error}" if error else None

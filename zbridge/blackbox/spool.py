@@ -287,10 +287,12 @@ class Spool:
         self._counted(cause.code)
         log.warning("incident", "kept as {name}: {reason}", name=unique, reason=cause.text, code=cause.code)
         for segment in fresh:
-            segment.rename(folder.incidents / unique / segment.name)
+            with contextlib.suppress(FileNotFoundError):  # another process, which hands over, deletes some too
+                segment.rename(folder.incidents / unique / segment.name)
         if self._settings.fsync:
             self._sync(folder.incidents / unique)
-        self._remove_surplus()
+        for surplus in folder.surplus(self._settings.keep):
+            self._attempt(self._remove, surplus)
 
     def _fresh(self, order: Keep) -> list[Path]:
         """Return the segments of the ring that belong to the minutes before."""
@@ -339,13 +341,11 @@ class Spool:
         if self._until <= now or began_s >= self.longest_s or not segments:
             self._end_incident()
 
-    def _remove_surplus(self) -> None:
-        for name in self.folder.surplus(self._settings.keep):
-            if self.incident is None or name != self.incident.name:
-                self.folder.remove(name)
-                self._counted("removed")
-                keep = self._settings.keep
-                log.warning("incident_removed", "{name} was deleted: keep = {keep}", name=name, keep=keep)
+    def _remove(self, name: str) -> None:
+        if self.incident is None or name != self.incident.name:
+            self.folder.remove(name)
+            self._counted("removed")
+            log.warning("incident_removed", "{name} was deleted: keep = {keep}", name=name, keep=self._settings.keep)
 
 
 def _records_of(segment: Path) -> Iterator[Record]:

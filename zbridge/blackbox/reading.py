@@ -8,7 +8,7 @@ from pathlib import Path
 
 import msgspec
 
-from zbridge.blackbox.incidents import BoxFolder, IncidentInfo, is_incident_name
+from zbridge.blackbox.incidents import BoxFolder, IncidentInfo, head_of, is_incident_name
 from zbridge.blackbox.segments import Damage, Record, SegmentHead, read_segment
 from zbridge.errors import Unsupported
 from zbridge.fleet.incidents import FILES, PART_BYTES, IncidentEntry, IncidentPart, Incidents, ReadIncident
@@ -65,14 +65,15 @@ def read_part(folder: BoxFolder, question: ReadIncident) -> IncidentPart:
     if path is None:
         raise Unsupported(f"{name} has no file {question.file!r}")
     with path.open("rb") as file:
-        file.seek(question.offset)
+        file.seek(min(question.offset, os.fstat(file.fileno()).st_size))
         return IncidentPart(data=file.read(PART_BYTES))
 
 
 def read_records(segments: list[Path], findings: Findings) -> Iterator[KeptRecord]:
     """Yield the messages of segments in order; note in ``findings`` what was found. Raises OSError."""
-    offset_ns = 0
     boot = None
+    first = next((head for path in segments if (head := head_of(path)) is not None), None)
+    offset_ns = first.wall_ns - first.mono_ns if first is not None else 0  # until the first head that is not damaged
     lost: dict[int, int] = {}
     for path in segments:
         for content in read_segment(path.read_bytes()):

@@ -19,7 +19,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 
@@ -39,7 +39,7 @@ class IncidentCause(msgspec.Struct, frozen=True):
 
     code: str
     text: str
-    at_ns: int
+    at_ns: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 
 
 class IncidentInfo(msgspec.Struct, frozen=True):
@@ -54,7 +54,7 @@ class IncidentInfo(msgspec.Struct, frozen=True):
     realm: str
     robot: str
     number: int
-    causes: tuple[IncidentCause, ...]
+    causes: Annotated[tuple[IncidentCause, ...], msgspec.Meta(min_length=1)]
     ended_ns: int | None = None
     more: int = 0
     before: str | None = None

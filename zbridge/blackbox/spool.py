@@ -131,8 +131,7 @@ class Spool:
         self.error = None
         for is_record, group in groupby(items, lambda item: type(item) is tuple):
             if is_record:
-                self._attempt(self._write_records, group, now)
-                self.unwritten += sum(1 for _ in group)
+                self._attempt_records(group, now)  # type: ignore[arg-type]
             else:
                 for order in group:
                     self._take_order(order, now)  # type: ignore[arg-type]
@@ -177,7 +176,11 @@ class Spool:
             self._attempt(self._keep_pending, now)
         else:
             self._end_segment()
-            self._attempt(self._write_records, order.records, now)
+            self._attempt_records(iter(order.records), now)
+
+    def _attempt_records(self, records: Iterator[Record], now: float) -> None:
+        self._attempt(self._write_records, records, now)
+        self.unwritten += sum(1 for _ in records)
 
     def _write_records(self, records: Iterable[Record], now: float) -> None:
         if self._segment is not None and now - self._began >= _LATE * SEGMENT_S:

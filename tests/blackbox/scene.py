@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 from collections import Counter
 from collections.abc import Sequence
@@ -102,6 +103,7 @@ class Process:
         """Let time pass: each segment has one message, which says when it came."""
         end = self.scene.now + seconds
         while self.scene.now < end:
+            self.write()
             self.write(NextSegment((self.record(STATUS, "status"),)), self.record(text.format(now=self.scene.now)))
             self.scene.now += SEGMENT_S
         self.scene.now = end
@@ -130,6 +132,7 @@ class Disk:
         monkeypatch.setattr("os.write", self.write)
         monkeypatch.setattr("os.open", self.open)
         monkeypatch.setattr("os.mkdir", self.mkdir)
+        monkeypatch.setattr("os.fdopen", self.fdopen)
 
     def write(self, descriptor: int, data: bytes | memoryview) -> int:
         if self.room is None:
@@ -144,6 +147,12 @@ class Disk:
         if self.fault is not None and flags & os.O_CREAT:
             raise OSError(self.fault, os.strerror(self.fault), str(path))
         return self._open(path, flags, *more, **named)
+
+    def fdopen(self, descriptor: int, mode: str) -> io.RawIOBase:
+        file = io.FileIO(descriptor, mode)
+        if self.room is not None:
+            file.write = lambda data: self.write(descriptor, data)  # type: ignore[method-assign]
+        return file
 
     def mkdir(self, path: Any, *more: Any, **named: Any) -> None:
         if self.fault is not None and not os.path.exists(path):

@@ -140,6 +140,7 @@ class BlackBox:
             logging.getLogger().addHandler(self._handler)
             self._disk.add(self._work)
             self._next_segment()
+            self._disk.wake()  # from now on, a process that dies is noticed
 
     def close(self, error: BaseException | None = None, *, handed_over: bool = False) -> None:
         """Write what waits, for :data:`CLOSE_S` at most; idempotent. error: the fault by which the gateway ends."""

@@ -248,9 +248,9 @@ class BlackBox:
     def _write(self) -> None:
         ending, spool, now = self._ending, self._spool, time.monotonic()
         error = None if self._ready else self._open(spool, now)
-        lines: list[Item] = [self._lines.popleft() for _ in range(len(self._lines))]
+        lines = [self._lines.popleft() for _ in range(len(self._lines))]
         items = [self._waiting.popleft() for _ in range(len(self._waiting))]
-        spool.write(lines + items, now)
+        spool.write(_in_order(lines, items), now)
         self._taken_bytes += sum(RECORD_BYTES + (len(item[2]) if type(item) is tuple else 0) for item in items)
         self._taken_orders += sum(1 for item in items if type(item) is not tuple)
         self._worked_at = time.monotonic()
@@ -300,6 +300,17 @@ class _BoxHandler(logging.Handler):
             self._box.log_line(record)
         except Exception:
             self.handleError(record)
+
+
+def _in_order(lines: list[Record], items: list[Item]) -> Iterator[Item]:
+    """Yield lines of the log at their time between what waited."""
+    at = 0
+    for item in items:
+        while at < len(lines) and type(item) is tuple and lines[at][0] <= item[0]:
+            yield lines[at]
+            at += 1
+        yield item
+    yield from lines[at:]
 
 
 def _boot_id() -> str:

@@ -12,6 +12,7 @@ from tests.e2e.rigs.robots import Robot, position
 from tests.ports import free_port
 from tests.scraped import samples, scrape, value
 from zbridge.control.events import StopCause
+from zbridge.control.faults import FaultCode
 from zbridge.errors import Code
 from zbridge.metrics import FAMILIES
 
@@ -21,7 +22,7 @@ CLOSED = {
     "robot": {"r1"},
     "direction": {"in", "out"},
     "role": {"hq", "robot"},
-    "code": set(Code),
+    "code": {*Code, *FaultCode},
     "cause": set(StopCause),
     "change": {"acquired", "taken_over", "released", "ended", "latched", "unlatched"},
     "outcome": {"established", "failed", "lost", "accepted", "turned_away"},

@@ -111,7 +111,7 @@ class Process:
 
     def end(self, *, handed_over: bool = False) -> None:
         self.scene.pid = self.pid
-        self.spool.close(handed_over=handed_over)
+        self.spool.close()
 
     def die(self) -> None:
         """End without taking leave: the lock goes, the file stays."""

@@ -1,7 +1,7 @@
 """The black box of a gateway: opened and closed with it, and what it answers on the bus.
 
 ``@rpc/blackbox/incidents`` lists the incidents, ``@rpc/blackbox/read/<name>`` returns a part of one of their files, and
-``@rpc/blackbox/keep/<name>`` keeps the minutes before now. The disk is read on another thread, one question at a time.
+``@rpc/blackbox/keep/<name>`` keeps the minutes before now. The disk is read by its own thread.
 """
 
 from __future__ import annotations
@@ -19,12 +19,11 @@ from zbridge.bus import Bus, Handle, IncomingQuery
 from zbridge.control.admission import NameFilter
 from zbridge.control.faults import Conditions, FaultCode
 from zbridge.control.latch_store import state_folder
-from zbridge.errors import Malformed, NotReady, PayloadError, Refused, ZbridgeError
+from zbridge.errors import Malformed, NotReady, PayloadError, Refused, ZbridgeError, describe
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.incidents import ReadIncident
 from zbridge.fleet.messages import Query, Text
-from zbridge.fleet.topics import KeySpace, is_concrete, unescape
-from zbridge.tasks import Tasks
+from zbridge.fleet.topics import KeySpace, is_concrete
 from zbridge.version import __version__
 
 MARK = "mark"
@@ -43,11 +42,11 @@ def box_folder(settings: BlackBoxSettings, state: Path | None = None) -> Path:
 
 @contextlib.contextmanager
 def open_black_box(
-    plan: GatewayPlan, keys: KeySpace, conditions: Conditions, state: Path | None, gone: Callable[[], bool], alone: bool
+    plan: GatewayPlan, keys: KeySpace, conditions: Conditions, state: Path | None, *, alone: bool
 ) -> Iterator[BlackBox | None]:
     """Yield the black box of a gateway, which is to be begun; None without ``[blackbox]``.
 
-    gone: whether a successor serves everything. alone: whether the process serves no other robot.
+    alone: whether the process serves no other robot.
     """
     settings = plan.config.blackbox
     if settings is None or plan.device is None:
@@ -74,7 +73,7 @@ def open_black_box(
         raise
     finally:
         conditions.occurred = lambda code, text: None
-        box.close(handed_over=gone())
+        box.close()
 
 
 def _died(conditions: Conditions, text: str) -> None:
@@ -88,9 +87,8 @@ class BoxServer:
 
     def __init__(self, bus: Bus, keys: KeySpace, box: BlackBox, clock: Callable[[], float]) -> None:
         self._box = box
-        self._tasks = Tasks()
         self._waiting = 0
-        self._disk = asyncio.Lock()
+        self._loop = asyncio.get_running_loop()
         prefix = keys.key("@rpc/blackbox")
         self._handles: list[Handle] = [
             bus.answer(f"{prefix}/incidents", self._list),
@@ -123,28 +121,36 @@ class BoxServer:
         except (Refused, PayloadError) as error:
             question.refuse(error if isinstance(error, Refused) else Malformed(str(error)))
             return
-        who = mark.sender or unescape(question.asked.rpartition("/")[2])
-        self._box.keep(MARK, f"{mark.text} ({who})")
-        question.answer(payloads.encode(Query()))
+        who = question.asked.rpartition("/")[2]  # the rules of a secure bus vouch for it
+        if self._box.keep(MARK, f"{mark.text} ({who})"):
+            question.answer(payloads.encode(Query()))
+        else:
+            question.refuse(NotReady("the black box is not written, or has just kept something"))
 
     def _ask_disk(self, question: IncomingQuery, answer: Callable[[], bytes]) -> None:
         if self._waiting >= WAITING:
             question.refuse(NotReady("too many questions wait for the disk"))
             return
         self._waiting += 1
-        self._tasks.start(self._answer(question, answer))
+        self._box.disk.call(lambda: self._work(question, answer))
 
-    async def _answer(self, question: IncomingQuery, answer: Callable[[], bytes]) -> None:
+    def _work(self, question: IncomingQuery, answer: Callable[[], bytes]) -> None:
+        """Find an answer, on the disk's thread."""
+        found: bytes | Refused
         try:
-            async with self._disk:
-                payload = await asyncio.to_thread(answer)
+            found = answer()
         except PayloadError as error:
-            question.refuse(Malformed(str(error)))
+            found = Malformed(str(error))
         except Refused as error:
-            question.refuse(error)
-        except OSError as error:
-            question.refuse(NotReady(f"the disk: {error.strerror or error}"))
+            found = error
+        except Exception as error:
+            found = NotReady(f"the disk: {getattr(error, 'strerror', None) or describe(error)}")
+        with contextlib.suppress(RuntimeError):  # the loop has ended
+            self._loop.call_soon_threadsafe(self._answer, question, found)
+
+    def _answer(self, question: IncomingQuery, found: bytes | Refused) -> None:
+        self._waiting -= 1
+        if isinstance(found, Refused):
+            question.refuse(found)
         else:
-            question.answer(payload)
-        finally:
-            self._waiting -= 1
+            question.answer(found)

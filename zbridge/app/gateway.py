@@ -165,10 +165,10 @@ class Gateway:
     @contextlib.contextmanager
     def _open_files(self, *, alone: bool) -> Iterator[Audit]:
         """Open what the gateway writes: the audit log, and the black box. alone: the process serves this robot only."""
-        gone, folder = self.restarts.gone.is_set, self._runtime.folder
+        folder = self._runtime.folder
         with (
             open_audit(self._plan, self.metrics, self.conditions) as audit,
-            open_black_box(self._plan, self._keys, self.conditions, folder, gone, alone) as self._box,
+            open_black_box(self._plan, self._keys, self.conditions, folder, alone=alone) as self._box,
         ):
             yield audit
 
@@ -276,6 +276,7 @@ class Gateway:
                     await incoming.part_restored()
                     await claim.resume()
                     device.enforcer.restore(store.load())  # one that came last is only in the file
+                    self._begin_recording(device)
 
                 await self._serve(bus, ownership, device, store, begin)
             elif not state.listeners:
@@ -311,7 +312,6 @@ class Gateway:
     ) -> None:
         """Serve the robot, and its camera, until another gateway takes it over."""
         self.restarts.device, camera = device, None
-        self._begin_recording(device)
         if self._plan.camera is not None:
             from zbridge.camera.camera import Camera
 
@@ -325,6 +325,9 @@ class Gateway:
         self._serving = Serving(
             self._keys.robot, device, ownership, store, self.conditions, show, camera, self._runtime.clock
         )
+
+        if begin is None:  # else this process may still be given up for the one before it
+            self._begin_recording(device)
         try:
             await self._serving.run(begin)
         finally:

@@ -17,6 +17,7 @@ import os
 import re
 import shutil
 import tempfile
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
@@ -144,11 +145,21 @@ class BoxFolder:
         shutil.rmtree(self.incidents / name)
 
     def surplus(self, keep: int) -> list[str]:
-        """Return the names of incidents beyond the newest ``keep``; damaged ones count as the oldest."""
-        known = [info.name for info in self.infos()]
-        damaged = [folder.name for folder in self._incident_folders() if folder.name not in known]
-        names = damaged + known
-        return names[: max(0, len(names) - keep)]
+        """Return the names of incidents beyond ``keep``: damaged ones, then the oldest of the most frequent code.
+
+        So a cause that comes again and again makes way for a rare one.
+        """
+        known = self.infos()
+        names = {info.name for info in known}
+        damaged = [folder.name for folder in self._incident_folders() if folder.name not in names]
+        count = max(0, len(damaged) + len(known) - keep)
+        surplus = damaged[:count]
+        while len(surplus) < count:
+            codes = Counter(info.causes[0].code for info in known)
+            oldest = next(info for info in known if codes[info.causes[0].code] == max(codes.values()))
+            known.remove(oldest)
+            surplus.append(oldest.name)
+        return surplus
 
     def _incident_folders(self) -> list[Path]:
         with contextlib.suppress(FileNotFoundError):
@@ -157,8 +168,14 @@ class BoxFolder:
 
     # The processes that write
 
+    def is_live(self) -> bool:
+        """Return whether a process writes."""
+        with contextlib.suppress(FileNotFoundError):
+            return any(map(_is_locked, self.live.iterdir()))
+        return False
+
     def dead(self) -> list[int]:
-        """Return the ids of processes that ended without taking leave, and forget them."""
+        """Return the ids of processes that did not shut down cleanly, and forget them."""
         found = []
         for path in sorted(self.live.iterdir()):
             with contextlib.suppress(OSError), path.open("rb") as file:
@@ -166,6 +183,10 @@ class BoxFolder:
                 path.unlink()
                 found += [int(path.name)] if path.name.isdecimal() else []
         return found
+
+    def others(self) -> bool:
+        """Return whether other processes write."""
+        return any(path.name != str(os.getpid()) for path in self.live.iterdir())
 
     def take_life(self) -> int:
         """Lock a file that shows that this process writes; return its descriptor."""
@@ -192,6 +213,15 @@ def boxes(folder: Path) -> Iterator[BoxFolder]:
             realm, at, robot = path.name.partition("@")
             if at and path.is_dir():
                 yield BoxFolder(folder, realm, robot)
+
+
+def _is_locked(path: Path) -> bool:
+    with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except OSError:
+            return True
+    return False
 
 
 def segments_of(folder: Path) -> list[Path]:

@@ -42,14 +42,15 @@ class Findings(msgspec.Struct):
 
 def list_incidents(folder: BoxFolder) -> Incidents:
     """Return the incidents of one robot."""
-    entries = tuple(_entry(folder, info) for info in folder.infos())
+    live = folder.is_live()
+    entries = tuple(_entry(folder, info, live) for info in folder.infos())
     return Incidents(entries, os.uname().nodename)
 
 
-def _entry(folder: BoxFolder, info: IncidentInfo) -> IncidentEntry:
+def _entry(folder: BoxFolder, info: IncidentInfo, live: bool) -> IncidentEntry:
     size = sum(path.stat().st_size for path in folder.parts(info.name))
     codes = tuple(dict.fromkeys(cause.code for cause in info.causes))
-    return IncidentEntry(info.name, codes, info.causes[0].text, info.began_ns, info.ended_ns is None, size)
+    return IncidentEntry(info.name, codes, info.causes[0].text, info.began_ns, live and info.ended_ns is None, size)
 
 
 def read_part(folder: BoxFolder, question: ReadIncident) -> IncidentPart:

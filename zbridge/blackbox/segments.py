@@ -79,7 +79,7 @@ def record_blocks(records: Iterable[Record]) -> Iterator[tuple[int, bytes]]:
     size = 0
     for record in records:
         waiting.append(record)
-        size += len(record[2]) + len(record[1]) + 16
+        size += len(record[1]) + len(record[2]) + len(record[3] or b"") + 16
         if size >= BLOCK_BYTES:
             yield len(waiting), _block(_RECORDS, _encode(waiting))
             waiting, size = [], 0

@@ -10,7 +10,8 @@ it. What follows has an incident of its own, which names the one with the minute
 
 An OSError ends the segment; what was not written is counted, the next call tries again, and causes that could not be
 noted are kept for it. A full disk costs the oldest segment of the ring at each attempt. What the process before left
-open is continued.
+open is continued. In a restart two processes write for a moment: segments have different names, causes are added to
+what the file says, and the incident that the first one began last is continued when it has left.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import shutil
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from datetime import UTC, datetime
@@ -70,8 +72,7 @@ Item = Record | NextSegment | Keep
 class Spool:
     """The writer of one robot's folder.
 
-    head: describes a segment that begins now. counted: called with the code of each incident that begins, and with
-    ``removed`` for each that is deleted.
+    head: describes a segment that begins now. counted: called with the code of each incident that begins.
     """
 
     def __init__(
@@ -86,16 +87,22 @@ class Spool:
         """Written so far."""
         self.unwritten = 0
         """Records that the disk did not take."""
+        self.removed = 0
+        """Incidents that were deleted for newer ones."""
         self.incident: IncidentInfo | None = None
         """The one that is open."""
         self.error: OSError | None = None
-        """Why the last attempt failed; None: it did not."""
+        """The last error; None: everything was written."""
         self.longest_s = settings.minutes * 60 + AFTER_S
         """Most seconds from the first cause of an incident to its end."""
         self._settings = settings
         self._head = head
         self._counted = counted
         self._life: int | None = None
+        self._shared = True
+        """Whether a process that hands over to this one may still write."""
+        self.died: list[int] = []
+        """Processes that did not shut down cleanly since :meth:`begin`."""
         self._dead: list[int] = []
         """Of :meth:`begin`, which may fail and be called again."""
         self._number = 0
@@ -115,15 +122,13 @@ class Spool:
         return f"<Spool {self.folder.path} {self._path.name}, incident {self.incident and self.incident.name}>"
 
     def begin(self, now: float, wall_ns: int) -> list[int]:
-        """Begin; return the processes before this one that ended without taking leave. now: seconds. Raises OSError."""
+        """Begin; return the processes before this one that did not shut down cleanly. now: seconds. Raises OSError."""
         self.folder.make()
         self._number = self._before = self.folder.last_number()
         self._dead += self.folder.dead()
         if self._life is None:
             self._life = self.folder.take_life()
-        for info in self.folder.infos():
-            if info.ended_ns is None:
-                self._continue(info, now, wall_ns)
+        self._adopt(now, wall_ns)
         return self._dead
 
     def write(self, items: Iterable[Item], now: float) -> None:
@@ -135,16 +140,15 @@ class Spool:
             else:
                 for order in group:
                     self._take_order(order, now)  # type: ignore[arg-type]
+        if self._shared and self._life is not None:
+            self._attempt(self._inherit, now)
         if self._pending:
             self._attempt(self._keep_pending, now)
         if self.incident is not None and now >= min(self._until, self._incident_began + self.longest_s):
             self._attempt(self._end_incident)
 
-    def close(self, *, handed_over: bool) -> None:
-        """End in order. handed_over: another process continues, also an incident that is open. Never raises."""
-        if self.incident is not None and not handed_over:
-            with contextlib.suppress(OSError):
-                self._end_incident()
+    def close(self) -> None:
+        """End in order; the next process continues an incident that is open, or ends it. Never raises."""
         self._end_segment()
         if self._life is not None:
             self.folder.end_life(self._life)
@@ -157,7 +161,6 @@ class Spool:
             work(*arguments)
         except OSError as error:
             self.error = error
-            self._end_segment()
             with contextlib.suppress(OSError, IndexError):
                 if error.errno in _FULL:
                     segments_of(self.folder.ring)[0].unlink()
@@ -172,7 +175,7 @@ class Spool:
 
     def _take_order(self, order: NextSegment | Keep, now: float) -> None:
         if isinstance(order, Keep):
-            self._pending.append(order)
+            self._pending.append(msgspec.structs.replace(order, frame=()) if self._pending else order)
             self._attempt(self._keep_pending, now)
         else:
             self._end_segment()
@@ -192,6 +195,7 @@ class Spool:
                 self._append(block)
             except OSError:
                 self.unwritten += count
+                self._end_segment()
                 raise
         if self._settings.fsync and self._segment is not None:
             os.fdatasync(self._segment)
@@ -250,7 +254,12 @@ class Spool:
 
     def _keep_pending(self, now: float) -> None:
         while self._pending:
-            self._keep(self._pending[0], now)
+            try:
+                self._keep(self._pending[0], now)
+            except OSError:
+                raise
+            except Exception:  # one cause that cannot be kept must not hold up all others
+                log.exception("cause_not_kept", "a cause cannot be kept: {cause}", cause=self._pending[0].cause)
             self._pending.popleft()
 
     def _keep(self, order: Keep, now: float) -> None:
@@ -259,14 +268,13 @@ class Spool:
         if self.incident is None:
             self._begin_incident(order, now)
         else:
-            joined = self.incident.joined(order.cause)
+            joined = self._noted(self.incident).joined(order.cause)
             if joined.more == self.incident.more:
                 self.folder.write_info(joined, fsync=self._settings.fsync)
             self.incident = joined
         self._until = now + AFTER_S
 
     def _begin_incident(self, order: Keep, now: float) -> None:
-        self._end_segment()
         folder, cause = self.folder, order.cause
         fresh = self._fresh(order)
         moment = datetime.fromtimestamp(cause.at_ns / 1e9, UTC)
@@ -283,12 +291,12 @@ class Spool:
         try:
             folder.write_info(info, fsync=self._settings.fsync)
         except OSError:
-            with contextlib.suppress(OSError):
-                (folder.incidents / unique).rmdir()
+            shutil.rmtree(folder.incidents / unique, ignore_errors=True)
             raise
         self.incident, self._incident_began = info, now
         self._counted(cause.code)
-        log.warning("incident", "kept as {name}: {reason}", name=unique, reason=cause.text, code=cause.code)
+        text = "{robot}: kept as {name}: {reason}"
+        log.warning("incident", text, robot=folder.robot, name=unique, reason=cause.text, code=cause.code)
         for segment in fresh:
             with contextlib.suppress(FileNotFoundError):  # another process, which hands over, deletes some too
                 segment.rename(folder.incidents / unique / segment.name)
@@ -309,14 +317,14 @@ class Spool:
         return [path for path in ring if _age_s(heads[path], reference) <= most_s]
 
     def _frame(self, order: Keep, fresh: Sequence[Path]) -> dict[str, Any]:
-        """Return what ``incident.json`` shows of the moment: of a process that died, its last words."""
+        """Return what ``incident.json`` shows of the moment: the frame, else the last words on disk."""
         head, records = self._head(), order.frame
-        if order.died:
-            heads = ((path, head_of(path)) for path in fresh if number_of(path) <= self._before)
-            theirs = [(path, each) for path, each in heads if each is not None]
-            if theirs:
-                head = theirs[-1][1]
-                records = [record for path, _ in theirs[-2:] for record in _records_of(path)]
+        if order.died or not records:
+            heads = ((path, head_of(path)) for path in fresh if not order.died or number_of(path) <= self._before)
+            known = [(path, each) for path, each in heads if each is not None]
+            if known:
+                head = known[-1][1]
+                records = [record for path, _ in known[-2:] for record in _records_of(path)]
         frame: dict[str, Any] = {"host": os.uname().nodename, "pid": head.pid, "lost": head.lost, **head.about}
         for _, key, payload, _ in records:
             path = key.split("/", 2)[-1]
@@ -328,14 +336,37 @@ class Spool:
     def _end_incident(self) -> None:
         assert self.incident is not None
         ended_ns = self._head().wall_ns
-        self.folder.write_info(msgspec.structs.replace(self.incident, ended_ns=ended_ns), fsync=self._settings.fsync)
+        info = msgspec.structs.replace(self._noted(self.incident), ended_ns=ended_ns)
+        self.folder.write_info(info, fsync=self._settings.fsync)
         self._last, self.incident = self.incident.name, None
         self._end_segment()
 
+    def _noted(self, info: IncidentInfo) -> IncidentInfo:
+        """Return an incident with the causes that a process which hands over has noted since."""
+        found = self.folder.info(info.name)
+        if found is None or len(found.causes) <= len(info.causes):
+            return info
+        return msgspec.structs.replace(info, causes=found.causes)
+
+    def _inherit(self, now: float) -> None:
+        """Adopt what the process that hands over began last, once it has left."""
+        self.died += self.folder.dead()
+        if not self.folder.others():
+            self._shared = False
+            self._adopt(now, self._head().wall_ns)
+
+    def _adopt(self, now: float, wall_ns: int) -> None:
+        """Continue the newest incident that another process left open, and end all others."""
+        own = self.incident.name if self.incident is not None else None
+        left = [info for info in self.folder.infos() if info.ended_ns is None and info.name != own]
+        newest = left.pop() if left and own is None else None
+        for info in left:
+            self.folder.write_info(msgspec.structs.replace(info, ended_ns=wall_ns), fsync=self._settings.fsync)
+        if newest is not None:
+            self._continue(newest, now, wall_ns)
+
     def _continue(self, info: IncidentInfo, now: float, wall_ns: int) -> None:
-        """Continue an incident that the process before left open; end it if its time is over."""
-        if self.incident is not None:
-            self._end_incident()
+        """Continue an incident; end it if its time is over."""
         segments = segments_of(self.folder.incidents / info.name)
         began_s = (wall_ns - info.began_ns) / 1e9
         since_s = (wall_ns - max(info.causes[-1].at_ns, info.began_ns)) / 1e9
@@ -347,8 +378,9 @@ class Spool:
     def _remove(self, name: str) -> None:
         if self.incident is None or name != self.incident.name:
             self.folder.remove(name)
-            self._counted("removed")
-            log.warning("incident_removed", "{name} was deleted: keep = {keep}", name=name, keep=self._settings.keep)
+            self.removed += 1
+            text = "{robot}: {name} was deleted: keep = {keep}"
+            log.warning("incident_removed", text, robot=self.folder.robot, name=name, keep=self._settings.keep)
 
 
 def _records_of(segment: Path) -> Iterator[Record]:

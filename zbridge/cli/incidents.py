@@ -132,7 +132,7 @@ def _show(info: IncidentInfo, findings: Findings | None, lines: Sequence[str], *
         more = {} if findings is None else {"read": _found(findings), "log": list(lines)}
         console.print(to_json({**msgspec.to_builtins(info), **more}))
         return
-    console.print(shown(f"{info.name}: {info.realm}/{info.robot}{'' if info.ended_ns else ', still open'}"))
+    console.print(shown(f"{info.name}: {info.realm}/{info.robot}{'' if info.ended_ns else ', no end yet'}"))
     for cause in info.causes:
         console.print(shown(f"{_time(cause.at_ns)} {cause.code}: {cause.text}"))
     if info.more:
@@ -207,7 +207,9 @@ def _require_new(output: Path) -> None:
 def remove_here(folder: Path, names: Sequence[str]) -> None:
     """Delete incidents of this host; raise ZbridgeError for the first that there is not."""
     for name in names:
-        box, _ = _find(folder, name, damaged=True)
+        box, info = _find(folder, name, damaged=True)
+        if info.ended_ns is None and info.causes and box.is_live():
+            raise ZbridgeError(f"{name} is still being written: wait a minute")
         box.remove(name)
         console.print(shown(f"{name}: deleted"))
 

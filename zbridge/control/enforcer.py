@@ -247,7 +247,6 @@ class Enforcer:
         while events := self.authority.events():
             for event in events:
                 self._counts.note(event)
-                self._faults.note(event)
                 if event.what is not EventKind.REFUSED:
                     changed = True
                     if event.what is not EventKind.ACQUIRED and self._limits is not None:
@@ -255,9 +254,10 @@ class Enforcer:
                 if event.stops:
                     self._send_stop()
                 if event.what in (EventKind.LATCHED, EventKind.UNLATCHED):
-                    self._faults.latched(self.authority.latches.in_force)
                     self._save_latches()
+                    self._faults.latched(self.authority.latches.in_force)
                 self._audit.write(event)
+                self._faults.note(event)
             self.lease_hook.notify()
             if self._control_due is None and not self._closed:
                 self._control_due = self._loop.call_later(_CONTROL_S, self.report)

@@ -167,9 +167,12 @@ class Conditions:
             self.changed()
 
     def happened(self, code: FaultCode, text: str) -> None:
-        """Note an event."""
+        """Note an event. ``changed`` is called where it opens a fault, or gives it another text."""
+        fault = self._open.get(code)
+        shown = fault.text if fault is not None else None
         self._occur(code, text, self._clock() + EVENT_S)
-        self.changed()
+        if text != shown:
+            self.changed()
 
     def expire(self) -> None:
         """Close the faults that have healed."""

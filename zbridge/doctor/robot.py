@@ -9,6 +9,7 @@ import difflib
 from collections.abc import Collection, Iterable, Iterator
 
 from zbridge.client.fleet_model import SILENT_S, RobotEntry
+from zbridge.control.faults import EVENTS
 from zbridge.doctor.findings import Finding, Layer, Verdict, error, note, ok, warning
 from zbridge.errors import Code
 from zbridge.fleet.messages import Control, Refusal, Status
@@ -127,12 +128,13 @@ def judge_link(
 
 
 def judge_faults(status: Status) -> Iterator[Finding]:
-    """Judge the open faults that nothing else of the status tells."""
+    """Judge the events of the last minute; what lasts is told by other findings."""
     for fault in status.faults:
-        if fault.text not in (status.reason or "") and fault.code != Code.LATCHED:
+        if fault.code in EVENTS:
             times = "once" if fault.count == 1 else f"{fault.count} times"
             text = f"{fault.code} {times} in the last minutes: {fault.text}"
-            yield warning(Layer.ROBOT, f"fault_{fault.code}", text, "what happened before: zbridge blackbox ls")
+            remedy = "zbridge blackbox ls: the minutes before are kept, if the gateway has [blackbox]"
+            yield warning(Layer.ROBOT, f"fault_{fault.code}", text, remedy)
 
 
 def judge_driving(control: Control, robot: str) -> Iterator[Finding]:

@@ -240,6 +240,7 @@ class Runner:
                 reason = str(error)
             else:
                 self._restart_delay.failed(process.lived_s)
+                self._died = None  # it was told
                 template = "{robot}: process {pid} continues with its connections"
                 log.info("connections_inherited", template, robot=self.file.robot, pid=successor.pid)
                 return successor

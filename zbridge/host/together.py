@@ -22,6 +22,8 @@ from zbridge.app.gateway import Gateway, Neighbourhood, robot_metrics
 from zbridge.app.joining import SessionUseless, can_connect, join_bus, watch_certificate, watch_session
 from zbridge.app.process_usage import USAGE
 from zbridge.app.readings import LoopLateness
+from zbridge.blackbox import DISK
+from zbridge.blackbox.box import CLOSE_S
 from zbridge.bus import Bus
 from zbridge.bus.tls.files import own_certificate
 from zbridge.control.faults import Conditions
@@ -86,6 +88,7 @@ class Together:
             except SessionUseless as error:
                 log.error("shared_session_useless", "{error}", error=error)
             finally:
+                DISK.settle(CLOSE_S)
                 self.left = await self._bus.close()
 
     async def _serve(self, bus: Bus) -> None:

@@ -15,6 +15,8 @@ from zbridge.fleet.processes import ProcessStats
 
 _CELL = 200
 """Most characters of a cell."""
+_SHOWN = ("latched", "robot_lost")
+"""Faults that other columns show."""
 _SHARED = "*"
 """Follows the processor and memory of a process that serves several robots."""
 
@@ -153,7 +155,7 @@ def _reason(entry: RobotEntry, state: RowState) -> str:
     }.get(state, "")
     reported = entry.status.reason or "" if entry.status is not None and state is not RowState.NO_GATEWAY else ""
     faults = entry.status.faults if entry.status is not None and state is not RowState.NO_GATEWAY else ()
-    more = (f"{fault.code}: {fault.text}" for fault in faults if fault.text not in reported)
+    more = (f"{each.code}: {each.text}" for each in faults if each.code not in _SHOWN and each.text not in reported)
     return shown("; ".join(filter(None, (own, entry.stopped_by, reported, *more))), _CELL)
 
 

@@ -236,9 +236,8 @@ def test_an_incident_names_the_one_before_only_while_the_ring_lacks_what_that_on
 def test_two_incidents_of_one_second_and_code_have_different_names(scene: Scene, process: Process) -> None:
     for _ in range(3):
         process.keep()
-        process.end()
-        process = scene.process(minutes=1.0)
-        process.begin()
+        process.run(AFTER_S)
+        scene.set_s -= AFTER_S
     assert scene.names == [f"20260101T000000Z-r1-deadman{copy}" for copy in ("", "-2", "-3")]
 
 

@@ -358,22 +358,20 @@ class Spool:
     def _adopt(self, now: float, wall_ns: int) -> None:
         """Continue the newest incident that another process left open, and end all others."""
         own = self.incident.name if self.incident is not None else None
-        left = [info for info in self.folder.infos() if info.ended_ns is None and info.name != own]
-        newest = left.pop() if left and own is None else None
-        for info in left:
-            self.folder.write_info(msgspec.structs.replace(info, ended_ns=wall_ns), fsync=self._settings.fsync)
-        if newest is not None:
-            self._continue(newest, now, wall_ns)
+        for info in reversed(self.folder.infos()):
+            if info.ended_ns is None and info.name != own:
+                self._continue(info, now, wall_ns)
 
     def _continue(self, info: IncidentInfo, now: float, wall_ns: int) -> None:
-        """Continue an incident; end it if its time is over."""
-        segments = segments_of(self.folder.incidents / info.name)
+        """Continue an incident if it is the newest, and its time is not over; else end it."""
         began_s = (wall_ns - info.began_ns) / 1e9
         since_s = (wall_ns - max(info.causes[-1].at_ns, info.began_ns)) / 1e9
+        if self.incident is not None or began_s >= self.longest_s or not 0.0 <= since_s < AFTER_S:
+            self.folder.write_info(msgspec.structs.replace(info, ended_ns=wall_ns), fsync=self._settings.fsync)
+            self._last = info.name
+            return
         self.incident, self._incident_began = info, now - max(began_s, 0.0)
-        self._until = now + (AFTER_S - since_s if 0.0 <= since_s <= AFTER_S else 0.0)
-        if self._until <= now or began_s >= self.longest_s or not segments:
-            self._end_incident()
+        self._until = now + AFTER_S - since_s
 
     def _remove(self, name: str) -> None:
         if self.incident is None or name != self.incident.name:

@@ -114,10 +114,9 @@ class Process:
         self.spool.close()
 
     def die(self) -> None:
-        """End without taking leave: the lock goes, the file stays."""
-        assert self.spool._life is not None
-        os.close(self.spool._life)
-        self.spool._end_segment()
+        """End without an orderly shutdown: the lock goes, the file stays."""
+        self.end()
+        (self.scene.folder.live / str(self.pid)).touch()
 
 
 class Disk:

@@ -99,7 +99,7 @@ def test_a_killed_gateway_leaves_all_but_the_last_seconds_and_the_next_one_keeps
     (info,) = until(lambda: box.incidents, what="the incident")
     kept = box.kept(info)
     assert box.codes == [["gateway_died"]]
-    assert f"process {pid} ended without taking leave" in info.causes[0].text
+    assert f"process {pid} did not shut down cleanly" in info.causes[0].text
     assert kept.records[: len(before.records)] == before.records
     assert before.pids == {info.frame["pid"]} == {pid}
     assert kept.findings.damaged == kept.findings.lost == 0
@@ -189,7 +189,7 @@ def test_a_supervisor_says_of_a_gateway_whether_it_hung_or_was_killed_and_the_wh
     assert before.of("@cmd/drive")
     host.run()
     info, text = host.incident("untouched", "gateway_died")
-    assert f"process {pids['untouched']} ended without taking leave" in text
+    assert f"process {pids['untouched']} did not shut down cleanly" in text
     records = host.boxes["untouched"].kept(info).records
     assert records[: len(before.records)] == before.records
     assert info.frame["control"]["holder"] == "op1"

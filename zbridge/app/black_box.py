@@ -23,7 +23,7 @@ from zbridge.errors import Malformed, NotReady, PayloadError, Refused, ZbridgeEr
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.incidents import ReadIncident
 from zbridge.fleet.messages import Query, Text
-from zbridge.fleet.topics import KeySpace, is_concrete
+from zbridge.fleet.topics import KeySpace, is_concrete, unescape
 from zbridge.version import __version__
 
 MARK = "mark"
@@ -121,7 +121,7 @@ class BoxServer:
         except (Refused, PayloadError) as error:
             question.refuse(error if isinstance(error, Refused) else Malformed(str(error)))
             return
-        who = question.asked.rpartition("/")[2]  # the rules of a secure bus vouch for it
+        who = unescape(question.asked.rpartition("/")[2])  # the rules of a secure bus vouch for it
         if self._box.keep(MARK, f"{mark.text} ({who})"):
             question.answer(payloads.encode(Query()))
         else:

@@ -8,6 +8,8 @@ import itertools
 import json
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -26,6 +28,7 @@ from tests.e2e.measured.restarts import Restarted
 from tests.e2e.rigs.boxes import Box
 from tests.e2e.rigs.fragile import charges
 from tests.e2e.rigs.hq_scene import playing, soon
+from tests.e2e.rigs.processes import ROOT
 from tests.e2e.rigs.robots import MOVE, STOP, Robot, position
 from tests.e2e.rigs.secure import SecureBus
 from tests.e2e.rigs.supervised import Supervised
@@ -422,6 +425,56 @@ def test_a_robot_is_driven_on_without_its_folder_the_loss_is_shown_and_counted_a
     kept = box.kept(info)
     assert kept.findings.damaged == 0
     assert 0 < kept.findings.lost <= counted
+
+
+@pytest.mark.pages
+def test_a_robot_is_driven_on_while_the_disk_is_full_and_what_was_written_can_be_read(
+    bench: Bench, robot: Robot
+) -> None:
+    disk, port, drive, file = bench.folder / "disk", free_port(), Drive(bench, robot), bench.folder / "r1.toml"
+    disk.mkdir()
+    bus = f'[bus]\nconnect = ["{bench.endpoint}"]\nmulticast = false\n[metrics]\nlisten = "{HOST}:{port}"\n'
+    file.write_text(f'[robot]\nname = "r1"\n{device(robot.port)}{boxed(disk)}{bus}')
+    gateway, log = on_a_small_disk(bench, disk, "run", str(file))
+    inside = Path(f"/proc/{gateway.pid}/root{disk}")
+    box, filler = Box(inside), inside / "filler"
+
+    def lost() -> float:
+        return value(scrape(port), "zbridge_blackbox_lost_total", reason="disk")
+
+    until(lambda: bench.fleet.state() == "established", what="established")
+    bench.fleet.hold(who="op1")
+    with repeated(drive.step):
+        until(lambda: box.ring().of("@cmd/drive"), what="drives on the disk")
+        with contextlib.suppress(OSError), filler.open("wb", buffering=0) as full:
+            while full.write(bytes(4096)):
+                pass
+        until(lambda: lost() > 0, what="the loss is counted")
+        until(lambda: "No space left" in (fault(bench, "black_box") or {"text": ""})["text"], what="the fault")
+        since = time.monotonic()
+        until(lambda: len(robot.packets(MOVE, since)) >= 5, what="the robot drives on")
+        assert not bench.fleet.lost()
+        filler.unlink()
+        number = drive.poses
+        until(lambda: any(pose["x"] * 100 > number for pose in box.ring().messages("pose")), what="the poses after it")
+    assert box.ring().findings.damaged == 0
+    end(gateway)
+    assert gateway.returncode == 0
+    assert "Traceback" not in log.read_text()
+
+
+def on_a_small_disk(bench: Bench, disk: Path, *arguments: str) -> tuple[subprocess.Popen[str], Path]:
+    """Start a command of zbridge with a small tmpfs at a folder, which others see below its root; and its log."""
+    path = bench.folder / "small.log"
+    mounted = f"mount -t tmpfs -o size=256k none {disk} && touch {disk}/mounted && exec {sys.executable} -m zbridge $@"
+    command = ["unshare", "--map-root-user", "--mount", "sh", "-c", mounted, "sh", *arguments]
+    with path.open("wb") as log:
+        process = subprocess.Popen(command, stdout=log, stderr=log, text=True, cwd=ROOT)
+    bench.stack.callback(end, process, signal.SIGKILL)
+    until(lambda: process.poll() is not None or Path(f"/proc/{process.pid}/root{disk}/mounted").exists())
+    if process.poll() is not None:
+        pytest.skip(f"no small disk here: {path.read_text().strip()}")
+    return process, path
 
 
 class BlockedWrites:

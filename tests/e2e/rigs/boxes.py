@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import Any
 
@@ -35,18 +36,23 @@ class Box:
 
     def ring(self) -> Kept:
         """Read the ring."""
-        return Kept(segments_of(self.folder.ring), self.folder.robot)
+        return self._read(self.folder.ring)
 
     def kept(self, info: IncidentInfo) -> Kept:
         """Read an incident."""
-        return Kept(segments_of(self.folder.incidents / info.name), self.folder.robot)
+        return self._read(self.folder.incidents / info.name)
+
+    def _read(self, folder: Path) -> Kept:
+        while True:
+            with contextlib.suppress(FileNotFoundError):  # a segment is renamed, or deleted, meanwhile
+                return Kept(segments_of(folder), self.folder.robot)
 
 
 class Kept:
     """The records of one robot, and the heads of the segments that they come from."""
 
     def __init__(self, segments: list[Path], robot: str) -> None:
-        self.findings = Findings(heads=[])
+        self.findings = Findings()
         self.records: list[KeptRecord] = list(read_records(segments, self.findings))
         self._prefix = f"fleet/{robot}/"
 

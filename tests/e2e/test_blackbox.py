@@ -40,7 +40,7 @@ from tests.views.recording import files
 from zbridge.app import Gateway, load
 from zbridge.blackbox import IncidentInfo
 from zbridge.blackbox.box import CLOSE_S
-from zbridge.cli.incidents import export_fetched, list_fleet
+from zbridge.cli.incidents import export_fetched, list_fleet, show_fetched
 from zbridge.cli.recording import put_mark
 from zbridge.errors import BusRefused
 
@@ -521,8 +521,9 @@ async def test_a_disk_that_hangs_delays_neither_drives_nor_the_loop_and_the_end_
     running.cancel()
     with contextlib.suppress(asyncio.CancelledError):
         await running
-    assert time.monotonic() - ending < CLOSE_S + 1.5 + withheld.seconds() - before_s
-    assert robot.packets(STOP, ending)
+    ended, patience_s = time.monotonic(), withheld.seconds() - before_s
+    assert robot.packets(STOP, ending)[0].at - ending < 0.3 + patience_s
+    assert ended - ending < CLOSE_S + 1.5 + patience_s
     disk.free.set()
 
 
@@ -551,6 +552,8 @@ async def test_a_viewer_lists_incidents_an_operator_keeps_them_and_a_supervisor_
         with pytest.raises(BusRefused, match=rf"{role}\.{name} may not read its incidents"):
             await export_fetched(settings(bus, name), "fleet", info.name, tmp_path / "refused.mcap", pictures=False)
     assert not (tmp_path / "refused.mcap").exists()
+    await show_fetched(settings(bus, "sup1"), "fleet", info.name, as_json=True)
+    assert json.loads(capsys.readouterr().out)["causes"][0]["text"] == "a dent (op1)"
     await export_fetched(settings(bus, "sup1"), "fleet", info.name, tmp_path / "a.mcap", pictures=False)
     fetched = [entry for entry in files.read(tmp_path / "a.mcap") if entry[0] == "fleet/r1/@wire/robot/out"]
     assert fetched

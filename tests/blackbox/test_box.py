@@ -280,6 +280,16 @@ async def test_memory_is_bounded_however_long_the_disk_hangs(scene: Scene) -> No
     assert len(scene.box.folder.infos()) == 1
 
 
+async def test_states_that_wait_for_a_disk_that_hangs_are_bounded(scene: Scene) -> None:
+    scene.box.begin()
+    scene.box.snapshot = lambda: [("fleet/r1/status", b"\x80")]
+    await asyncio.sleep(3600)
+    assert len(scene.box._waiting) == STATES
+    await scene.after(20)
+    assert len(scene.box._waiting) <= 1
+    assert scene.keys().count("status") >= 7, "and afterwards all is as before"
+
+
 async def test_a_disk_that_hangs_is_told_and_so_is_its_end(scene: Scene, caplog: pytest.LogCaptureFixture) -> None:
     scene.box.begin()
     await scene.after(24)
@@ -452,6 +462,7 @@ async def test_lines_of_the_log_are_recorded_from_info_on_from_any_thread(scene:
         logger.exception("it failed")
     scene.close()
     logger.info("too late")
+    assert scene.box._handler not in logging.getLogger().handlers
     lines = scene.lines()
     assert [(line.level, line.message, line.event) for line in lines[:2]] == [
         ("info", "here 1", "here"),

@@ -169,6 +169,11 @@ def test_after_a_restart_of_the_machine_the_clock_of_that_one_counts(scene: Scen
     assert seconds(scene) == [0, 62]
 
 
+def test_a_machine_that_starts_with_a_wrong_clock_dates_its_messages_by_it(scene: Scene) -> None:
+    written(scene, segment(said("a", 900), head=head(0, 900)), segment(said("b", 7), head=head(-5000, 5, boot="new")))
+    assert seconds(scene) == [0, -4998]
+
+
 def test_messages_behind_a_damaged_head_have_their_times(scene: Scene) -> None:
     contents = [segment(said(f"{n}", 10 * n), head=head(10 * n, 10 * n)) for n in range(3)]
     for hit in range(3):

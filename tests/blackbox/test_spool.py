@@ -342,7 +342,7 @@ def test_a_day_at_ten_messages_a_second_stays_within_its_bounds_all_the_time(sce
         scene.now += SEGMENT_S
         if number % 1000 == 999:
             process.keep()
-        if number % 20 == 0:
+        if number % 60 == 0:
             bounds_hold(scene, process, 3, 21 * segment_bytes, FULL * segment_bytes)
     assert len(messages(scene.ring)) == FULL * 100
     assert process.spool.bytes > 24 * 3600 * 10 * 100

@@ -114,7 +114,7 @@ class Process:
         self.scene.now = end
         self.write()
 
-    def end(self, *, handed_over: bool = False) -> None:
+    def end(self) -> None:
         self.scene.pid = self.pid
         self.spool.close()
 

@@ -583,7 +583,7 @@ def test_an_incident_left_open_is_continued_within_its_minute(scene: Scene, proc
     process.run(70)
     process.keep()
     process.run(20)
-    process.end(handed_over=True)
+    process.end()
     after = successor(scene)
     after.begin()
     after.run(60)
@@ -704,7 +704,7 @@ def test_two_processes_that_hand_over_overwrite_nothing_of_each_other(scene: Sce
     assert len(scene.ring) == 8 - 1
     assert texts(scene.ring)[-6:] == [f"{pid} {number}" for number in range(3) for pid in (100, 101)]
     process.say("100 end")
-    process.end(handed_over=True)
+    process.end()
     after.run(10)
     assert "100 end" in texts(scene.ring)
     assert (process.spool.error, after.spool.error) == (None, None)
@@ -718,7 +718,7 @@ def test_an_incident_during_a_handover_keeps_the_segments_of_both(scene: Scene, 
     after.write(NextSegment([after.record("new")]))
     after.keep()
     process.say("old goes on")
-    process.end(handed_over=True)
+    process.end()
     after.run(20)
     assert scene.kept(scene.only_incident().name) == ["1000", "1010", "old", "old goes on", "new", "1020", "1030"]
 

@@ -109,8 +109,6 @@ class BlackBox:
         """When the thread ended its last round."""
         self._error: str | None = None
         """Why the disk did not take the last round."""
-        self._told: str | None = None
-        """The error that the loop was called for."""
         self._reported: str | None = None
         self._full_before = 0
         """How many had found no room when the current segment began."""
@@ -274,8 +272,7 @@ class BlackBox:
             self._end()
         finally:
             current_robot.reset(token)
-            if self._error != self._told:
-                self._told = self._error
+            if self._error != self._reported:
                 self._call(self._report)
 
     def _end(self) -> None:

@@ -16,7 +16,7 @@ from tests.fake_bus import FakeBus, FakeQuery
 from tests.machine import Patience
 from zbridge.app.black_box import WAITING, BoxServer, box_folder, open_black_box
 from zbridge.app.config import plan
-from zbridge.blackbox import BlackBox, BlackBoxSettings, BoxFolder, IncidentInfo
+from zbridge.blackbox import DISK, BlackBox, BlackBoxSettings, BoxFolder, IncidentInfo
 from zbridge.blackbox.incidents import IncidentCause
 from zbridge.control.faults import Conditions, FaultCode
 from zbridge.errors import Code, Refused, ZbridgeError

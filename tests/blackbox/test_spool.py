@@ -610,8 +610,10 @@ def test_an_incident_left_open_beyond_its_longest_time_is_ended(scene: Scene, pr
     process.run(10)
     for _ in range(3):
         process.keep()
-        process.run(40)
+        process.run(35)
     process.die()
+    scene.now += 20
+    assert scene.only_incident().ended_ns is None
     successor(scene).begin()
     assert scene.only_incident().ended_ns is not None
 

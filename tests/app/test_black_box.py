@@ -16,7 +16,7 @@ from tests.fake_bus import FakeBus, FakeQuery
 from tests.machine import Patience
 from zbridge.app.black_box import WAITING, BoxServer, box_folder, open_black_box
 from zbridge.app.config import plan
-from zbridge.blackbox import DISK, BlackBox, BlackBoxSettings, BoxFolder, IncidentInfo
+from zbridge.blackbox import BlackBox, BlackBoxSettings, BoxFolder, IncidentInfo
 from zbridge.blackbox.incidents import IncidentCause
 from zbridge.control.faults import Conditions, FaultCode
 from zbridge.errors import Code, Refused, ZbridgeError
@@ -99,7 +99,6 @@ async def test_an_incident_among_the_faults_keeps_the_minutes_before_it(gateway:
     gateway.conditions.happened(FaultCode.DEADMAN, "too late")
     assert gateway.causes() == [("robot_lost", "closed")]
     (info,) = gateway.folder.infos()
-    assert info.ended_ns is not None
     assert len(gateway.folder.parts(info.name)) == 2
 
 
@@ -200,7 +199,7 @@ class Served:
         self.bus = FakeBus()
         self.box = BlackBox(KEYS, path, BlackBoxSettings(), {})
         self.kept: list[tuple[str, str]] = []
-        self.box.keep = lambda code, text, **_: self.kept.append((code, text))  # type: ignore[method-assign]
+        self.box.keep = self._keep  # type: ignore[method-assign]
         self.folder = self.box.folder
         self.folder.make()
         (self.folder.incidents / "one").mkdir()
@@ -215,6 +214,10 @@ class Served:
         query = FakeQuery(key, payload)
         handler(query)
         return query
+
+    def _keep(self, code: str, text: str, *, died: bool = False) -> bool:
+        self.kept.append((code, text))
+        return True
 
     async def answer(self, path: str, payload: bytes = b"\x80") -> bytes | Code:
         """Return what is answered, or the code of the refusal."""

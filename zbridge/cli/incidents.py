@@ -195,8 +195,8 @@ async def export_fetched(settings: BusSettings, realm: str, name: str, output: P
 def _export(parts: list[Path], info: IncidentInfo, output: Path, *, pictures: bool) -> None:
     _require_new(output)
     findings = export_incident(parts, info, output, Pictures() if pictures else None)
-    errors.print(shown(f"{findings.records} messages to {output}"))
     _print_findings(findings)
+    console.print(shown(f"written to {output}"))
 
 
 def _require_new(output: Path) -> None:

@@ -243,9 +243,9 @@ class BlackBox:
 
     def _report(self) -> None:
         """Tell what is wrong now, if that is new."""
-        text, silent_s = self._error, time.monotonic() - self._worked_at
-        if silent_s > STUCK_S and not self._ended.is_set():
-            text = f"the black box is not written: the disk has not answered for {silent_s:.0f} s"
+        text = self._error
+        if time.monotonic() - self._worked_at > STUCK_S and not self._ended.is_set():
+            text = "the black box is not written: the disk does not answer"
         elif text is None and self._full > self._full_before:
             text = "the black box loses messages: too many wait for the disk"
         if text == self._reported:

@@ -30,7 +30,8 @@ from typing import Any
 import msgspec
 
 from zbridge.blackbox.incidents import BoxFolder, IncidentCause, IncidentInfo, head_of, number_of, segments_of
-from zbridge.blackbox.segments import SUFFIX, Record, SegmentHead, head_block, read_segment, record_blocks
+from zbridge.blackbox.segment_writer import SegmentWriter, sync_folder
+from zbridge.blackbox.segments import Record, SegmentHead, read_segment, record_blocks
 from zbridge.blackbox.settings import SEGMENT_S, BlackBoxSettings
 from zbridge.log import Log
 
@@ -83,8 +84,6 @@ class Spool:
         counted: Callable[[str], object] = lambda what: None,
     ) -> None:
         self.folder = folder
-        self.bytes = 0
-        """Written so far."""
         self.unwritten = 0
         """Records that the disk did not take."""
         self.removed = 0
@@ -95,6 +94,8 @@ class Spool:
         """Why the last attempt to write something failed; None: it did not."""
         self.longest_s = settings.minutes * 60 + AFTER_S
         """Most seconds from the first cause of an incident to its end."""
+        self._most_made = settings.segments + round(AFTER_S / SEGMENT_S)
+        """Most segments of an incident after its first cause: a robot that floods makes large ones in a short time."""
         self._settings = settings
         self._head = head
         self._counted = counted
@@ -105,26 +106,28 @@ class Spool:
         """Processes that did not shut down cleanly since :meth:`begin`."""
         self._dead: list[int] = []
         """Of :meth:`begin`, which may fail and be called again."""
-        self._number = 0
         self._before = 0
         """Segments up to this number are of processes before this one; its id may be the same in a container."""
-        self._segment: int | None = None
-        """The descriptor of the current segment."""
-        self._path = folder.ring
-        self._size = 0
-        self._began = 0.0
+        self._segment = SegmentWriter(head, fsync=settings.fsync)
         self._incident_began = self._until = 0.0
         self._last: str | None = None
         """The incident before, while the ring lacks what it took."""
-        self._pending: deque[Keep] = deque(maxlen=PENDING)
+        self._pending: deque[Keep] = deque()
+        self._made = 0
+        """Segments that were made in the incident that is open."""
 
     def __repr__(self) -> str:
-        return f"<Spool {self.folder.path} {self._path.name}, incident {self.incident and self.incident.name}>"
+        return f"<Spool {self.folder.path} {self._segment!r}, incident {self.incident and self.incident.name}>"
+
+    @property
+    def bytes(self) -> int:
+        """Written so far."""
+        return self._segment.bytes
 
     def begin(self, now: float, wall_ns: int) -> list[int]:
         """Begin; return the processes before this one that did not shut down cleanly. now: seconds. Raises OSError."""
         self.folder.make()
-        self._number = self._before = self.folder.last_number()
+        self._segment.number = self._before = self.folder.last_number()
         self._dead += self.folder.dead()
         if self._life is None:
             self._life = self.folder.take_life()
@@ -144,14 +147,16 @@ class Spool:
             self._attempt(self._inherit, now)
         if self._pending:
             self._attempt(self._keep_pending, now)
-        if self.incident is not None and now >= min(self._until, self._incident_began + self.longest_s):
+        if self.incident is not None and (
+            now >= min(self._until, self._incident_began + self.longest_s) or self._made > self._most_made
+        ):
             self._attempt(self._end_incident)
         if self.error is None and self.bytes == written:  # there was nothing to write: that says nothing of the disk
             self.error = before
 
     def close(self) -> None:
         """End in order; the next process continues an incident that is open, or ends it. Never raises."""
-        self._end_segment()
+        self._segment.end()
         if self._life is not None:
             self.folder.end_life(self._life)
             self._life = None
@@ -177,10 +182,11 @@ class Spool:
 
     def _take_order(self, order: NextSegment | Keep, now: float) -> None:
         if isinstance(order, Keep):
-            self._pending.append(msgspec.structs.replace(order, frame=()) if self._pending else order)
+            if len(self._pending) < PENDING:
+                self._pending.append(msgspec.structs.replace(order, frame=()) if self._pending else order)
             self._attempt(self._keep_pending, now)
         else:
-            self._end_segment()
+            self._segment.end()
             self._attempt_records(iter(order.records), now)
 
     def _attempt_records(self, records: Iterator[Record], now: float) -> None:
@@ -188,69 +194,31 @@ class Spool:
         self.unwritten += sum(1 for _ in records)
 
     def _write_records(self, records: Iterable[Record], now: float) -> None:
-        if self._segment is not None and now - self._began >= _LATE * SEGMENT_S:
-            self._end_segment()
+        segment = self._segment
+        if segment.is_open and now - segment.began >= _LATE * SEGMENT_S:
+            segment.end()
         for count, block in record_blocks(records):
             try:
-                if self._segment is None or self._size >= SEGMENT_BYTES:
+                if not segment.is_open or segment.size >= SEGMENT_BYTES:
                     self._next_segment(now)
-                self._append(block)
+                segment.append(block)
             except OSError:
                 self.unwritten += count
-                self._end_segment()
+                segment.end()
                 raise
-        if self._settings.fsync and self._segment is not None:
-            os.fdatasync(self._segment)
-
-    def _append(self, block: bytes) -> None:
-        """Write a block whole, or nothing of it."""
-        assert self._segment is not None
-        rest = memoryview(block)
-        try:
-            while rest:
-                rest = rest[os.write(self._segment, rest) :]
-        except OSError:
-            with contextlib.suppress(OSError):
-                os.ftruncate(self._segment, self._size)
-            raise
-        self._size += len(block)
-        self.bytes += len(block)
+        segment.sync()
 
     def _next_segment(self, now: float) -> None:
-        self._end_segment()
-        folder = self.folder.ring if self.incident is None else self.folder.incidents / self.incident.name
-        for _ in range(100):  # another process, which hands over, may make some too
-            self._number += 1
-            path = folder / f"{self._number:010d}{SUFFIX}"
-            with contextlib.suppress(FileExistsError):
-                self._segment = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-                break
-        else:
-            raise OSError(errno.EEXIST, f"no free number after {self._number}")
-        self._path, self._size, self._began = path, 0, now
-        try:
-            self._append(head_block(self._head()))
-        except OSError:
-            path.unlink(missing_ok=True)
-            raise
-        if self._settings.fsync:
-            self._sync(folder)
+        self._segment.begin(self._folder, now)
+        self._made += 1
         if self.incident is None:
             for old in segments_of(self.folder.ring)[: -self._settings.segments]:
                 old.unlink(missing_ok=True)
 
-    def _end_segment(self) -> None:
-        segment, self._segment = self._segment, None
-        if segment is not None:
-            with contextlib.suppress(OSError):
-                os.close(segment)
-
-    def _sync(self, folder: Path) -> None:
-        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+    @property
+    def _folder(self) -> Path:
+        """Where segments are made."""
+        return self.folder.ring if self.incident is None else self.folder.incidents / self.incident.name
 
     # Incidents
 
@@ -287,7 +255,15 @@ class Spool:
             unique = f"{name}-{copy}"
         before = self._last if not fresh or len(fresh) < self._settings.segments - 1 else None
         info = IncidentInfo(
-            unique, folder.realm, folder.robot, self._number, (cause,), None, 0, before, self._frame(order, fresh)
+            unique,
+            folder.realm,
+            folder.robot,
+            self._segment.number,
+            (cause,),
+            None,
+            0,
+            before,
+            self._frame(order, fresh),
         )
         (folder.incidents / unique).mkdir(mode=0o700)
         try:
@@ -295,7 +271,7 @@ class Spool:
         except OSError:
             shutil.rmtree(folder.incidents / unique, ignore_errors=True)
             raise
-        self.incident, self._incident_began = info, now
+        self.incident, self._incident_began, self._made = info, now, 0
         self._counted(cause.code)
         text = "{robot}: kept as {name}: {reason}"
         log.warning("incident", text, robot=folder.robot, name=unique, reason=cause.text, code=cause.code)
@@ -303,7 +279,7 @@ class Spool:
             with contextlib.suppress(FileNotFoundError):  # another process, which hands over, deletes some too
                 segment.rename(folder.incidents / unique / segment.name)
         if self._settings.fsync:
-            self._sync(folder.incidents / unique)
+            sync_folder(folder.incidents / unique)
         for surplus in folder.surplus(self._settings.keep):
             self._attempt(self._remove, surplus)
 
@@ -341,7 +317,7 @@ class Spool:
         info = msgspec.structs.replace(self._noted(self.incident), ended_ns=ended_ns)
         self.folder.write_info(info, fsync=self._settings.fsync)
         self._last, self.incident = self.incident.name, None
-        self._end_segment()
+        self._segment.end()
 
     def _noted(self, info: IncidentInfo) -> IncidentInfo:
         """Return an incident with the causes that a process which hands over has noted since."""
@@ -372,7 +348,7 @@ class Spool:
             self.folder.write_info(msgspec.structs.replace(info, ended_ns=wall_ns), fsync=self._settings.fsync)
             self._last = info.name
             return
-        self.incident, self._incident_began = info, now - max(began_s, 0.0)
+        self.incident, self._incident_began, self._made = info, now - max(began_s, 0.0), 0
         self._until = now + AFTER_S - since_s
 
     def _remove(self, name: str) -> None:

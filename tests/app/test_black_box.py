@@ -18,7 +18,7 @@ from zbridge.app.black_box import WAITING, BoxServer, box_folder, open_black_box
 from zbridge.app.config import plan
 from zbridge.blackbox import BlackBox, BlackBoxSettings, BoxFolder, IncidentInfo
 from zbridge.blackbox.incidents import IncidentCause
-from zbridge.control.faults import Conditions, FaultCode
+from zbridge.control.faults import FaultCode, OpenFaults
 from zbridge.errors import Code, Refused, ZbridgeError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.incidents import IncidentPart, Incidents, ReadIncident
@@ -35,13 +35,13 @@ class Gateway:
 
     def __init__(self, folder: Path, **settings: Any) -> None:
         self.folder = BoxFolder(folder / "blackbox", "fleet", "r1")
-        self.conditions = Conditions()
+        self.open_faults = OpenFaults()
         self.plan = plan({"robot": {"name": "r1"}, "device": DEVICE, "blackbox": settings})
-        self.opened = open_black_box(self.plan, KEYS, self.conditions, folder, alone=True)
+        self.opened = open_black_box(self.plan, KEYS, self.open_faults, folder, alone=True)
 
     @property
     def codes(self) -> list[str]:
-        return [fault.code for fault in self.conditions.faults]
+        return [fault.code for fault in self.open_faults.faults]
 
     def causes(self) -> list[tuple[str, str]]:
         (info,) = self.folder.infos()
@@ -80,7 +80,7 @@ def test_the_files_are_where_the_configuration_says_or_beside_latched_stops(
 
 async def test_without_the_table_there_is_no_black_box(tmp_path: Path) -> None:
     without = plan({"robot": {"name": "r1"}, "device": DEVICE})
-    with open_black_box(without, KEYS, Conditions(), tmp_path, alone=True) as box:
+    with open_black_box(without, KEYS, OpenFaults(), tmp_path, alone=True) as box:
         assert box is None
     assert os.listdir(tmp_path) == []
 
@@ -91,12 +91,12 @@ async def test_without_the_table_there_is_no_black_box(tmp_path: Path) -> None:
 async def test_an_incident_among_the_faults_keeps_the_minutes_before_it(gateway: Gateway) -> None:
     with gateway.opened as box:
         assert box is not None
-        gateway.conditions.happened(FaultCode.DEADMAN, "too early")
+        gateway.open_faults.happened(FaultCode.DEADMAN, "too early")
         box.begin()
         box.put("fleet/r1/pose", b"\x80")
-        gateway.conditions.happened(FaultCode.ROBOT_LOST, "closed")
-        gateway.conditions.set(FaultCode.AUDIT_LOG, "disk full")
-    gateway.conditions.happened(FaultCode.DEADMAN, "too late")
+        gateway.open_faults.happened(FaultCode.ROBOT_LOST, "closed")
+        gateway.open_faults.set(FaultCode.AUDIT_LOG, "disk full")
+    gateway.open_faults.happened(FaultCode.DEADMAN, "too late")
     assert gateway.causes() == [("robot_lost", "closed")]
     (info,) = gateway.folder.infos()
     assert len(gateway.folder.parts(info.name)) == 2
@@ -107,7 +107,7 @@ async def test_the_freeze_frame_has_versions_and_the_configuration_without_secre
     with gateway.opened as box:
         assert box is not None
         box.begin()
-        gateway.conditions.happened(FaultCode.DEADMAN, "no command")
+        gateway.open_faults.happened(FaultCode.DEADMAN, "no command")
     (info,) = gateway.folder.infos()
     assert set(info.frame["versions"]) == {"zbridge", "python", "protocol"}
     assert info.frame["configuration"] == gateway.plan.written
@@ -134,7 +134,7 @@ async def test_the_next_process_continues_an_incident_that_is_open(gateway: Gate
     with gateway.opened as box:
         assert box is not None
         box.begin()
-        gateway.conditions.happened(FaultCode.DEADMAN, "no command")
+        gateway.open_faults.happened(FaultCode.DEADMAN, "no command")
     assert [info.ended_ns for info in gateway.folder.infos()] == [None]
 
 
@@ -155,7 +155,7 @@ async def test_what_the_supervisor_said_of_its_end_counts_alone(gateway: Gateway
     with gateway.opened as box:
         assert box is not None
         box.begin()
-        gateway.conditions.happened(code, "no heartbeat")
+        gateway.open_faults.happened(code, "no heartbeat")
     await asyncio.sleep(0)
     assert gateway.codes == [code]
     assert gateway.causes() == [(code, "no heartbeat")]
@@ -171,7 +171,7 @@ async def test_only_the_end_of_the_process_before_concerns_its_minutes(
     kept = []
     monkeypatch.setattr(BlackBox, "keep", lambda box, code, text, *, died=False: kept.append((code, text, died)))
     with gateway.opened:
-        gateway.conditions.happened(code, "why")
+        gateway.open_faults.happened(code, "why")
     assert kept == [(code, "why", died)]
 
 
@@ -184,7 +184,7 @@ async def test_a_folder_that_cannot_be_written_is_a_fault_and_the_gateway_serves
         box.put("fleet/r1/pose", b"\x80")
     await asyncio.sleep(0)
     assert gateway.codes == ["black_box"]
-    (text,) = gateway.conditions.texts
+    (text,) = gateway.open_faults.texts
     assert text == f"the black box is not written: {gateway.folder.path}: Not a directory"
 
 

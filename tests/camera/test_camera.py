@@ -16,7 +16,7 @@ from zbridge.camera.demand import LINGER_S
 from zbridge.camera.mjpeg import MjpegPart, MjpegReader
 from zbridge.camera.settings import CameraSettings, CameraSource, plan_camera
 from zbridge.camera.upstream import OnParts
-from zbridge.control.faults import Conditions, FaultCode
+from zbridge.control.faults import FaultCode, OpenFaults
 from zbridge.errors import LinkError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import Image
@@ -33,7 +33,7 @@ class Scene:
     """A camera, and the bus that its images are put on. ``end`` ends the stream that is fetched now."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, *, rate_hz: float = 10.0) -> None:
-        self.bus, self.metrics, self.conditions = FakeBus(), Metrics(), Conditions()
+        self.bus, self.metrics, self.open_faults = FakeBus(), Metrics(), OpenFaults()
         self.begun: list[float] = []
         """When a stream was begun."""
         self.fetching = 0
@@ -42,7 +42,7 @@ class Scene:
         self.loop = asyncio.get_running_loop()
         plan = plan_camera(CameraSettings("http://robot/s", rate_hz=rate_hz, stall_s=3.0))
         monkeypatch.setattr(cameras, "fetch", self._fetch)
-        self.camera = Camera(plan, KeySpace("fleet", "r1"), self.bus, self.metrics, self.conditions, lambda: STAMP_NS)
+        self.camera = Camera(plan, KeySpace("fleet", "r1"), self.bus, self.metrics, self.open_faults, lambda: STAMP_NS)
         self._watched = False
 
     async def _fetch(self, source: CameraSource, stall_s: float, took: OnParts) -> None:
@@ -148,16 +148,16 @@ async def test_a_fault_is_shown_until_a_picture_comes_and_tried_again_later_and_
             ended_at = scene.loop.time()
             scene.end.set_result(LinkError("the stream ended"))
             await asyncio.sleep(0.001)
-            assert scene.conditions.texts == ("camera http://robot:80/s: the stream ended",)
+            assert scene.open_faults.texts == ("camera http://robot:80/s: the stream ended",)
             await asyncio.sleep(1.5 * RETRY_S)
             waits.append(scene.begun[-1] - ended_at)
         assert waits[0] < 1.5 < waits[-1]
         assert max(waits) < 1.3 * RETRY_S
         assert scene.counts()["failures"] == 6
         scene.read(bad=1)
-        assert scene.conditions.texts != (), "no picture yet"
+        assert scene.open_faults.texts != (), "no picture yet"
         scene.read(jpeg(1))
-        assert scene.conditions.texts == ()
+        assert scene.open_faults.texts == ()
 
 
 async def test_a_stream_that_lasted_is_fetched_again_soon(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -180,7 +180,7 @@ async def test_a_fault_of_nobody_who_watches_is_not_shown(monkeypatch: pytest.Mo
         scene.watch(False)
         scene.end.set_result(LinkError("the stream ended"))
         await asyncio.sleep(60.0)
-        assert scene.conditions.texts == ()
+        assert scene.open_faults.texts == ()
         assert len(scene.begun) == 1
 
 
@@ -190,7 +190,7 @@ async def test_an_error_of_ours_does_not_end_the_camera(monkeypatch: pytest.Monk
         await asyncio.sleep(0.01)
         scene.end.set_result(RuntimeError("what"))
         await asyncio.sleep(0.01)
-        assert "what" in scene.conditions.texts[0]
+        assert "what" in scene.open_faults.texts[0]
         await asyncio.sleep(2 * RETRY_S)
         assert len(scene.begun) == 2
 
@@ -215,7 +215,7 @@ async def test_the_end_of_a_camera_clears_what_it_showed(monkeypatch: pytest.Mon
         await asyncio.sleep(0.01)
         scene.end.set_result(LinkError("the stream ended"))
         await asyncio.sleep(0.01)
-        scene.conditions.set(FaultCode.CAMERA_RELAY, "camera relay 127.0.0.1:1: Address already in use")
-        assert len(scene.conditions.texts) == 2
-    assert scene.conditions.texts == ()
+        scene.open_faults.set(FaultCode.CAMERA_RELAY, "camera relay 127.0.0.1:1: Address already in use")
+        assert len(scene.open_faults.texts) == 2
+    assert scene.open_faults.texts == ()
     assert scene.fetching == 0

@@ -14,7 +14,7 @@ from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
 from zbridge.control.context import Faults, RobotContext
 from zbridge.control.enforcer import Enforcer
-from zbridge.control.faults import Conditions
+from zbridge.control.faults import OpenFaults
 from zbridge.control.lease_server import LeaseServer
 from zbridge.control.standstill import Standstill
 from zbridge.errors import NotReady, Refused, Unsupported
@@ -91,7 +91,7 @@ class Gateway:
             self.keys,
             self._bus,
             metrics,
-            Conditions(),
+            OpenFaults(),
             Faults(name),
             publish=self.publish,
             pump=lambda: None,

@@ -13,10 +13,10 @@ from tests.proofs import numbered
 from zbridge.bus import Sample
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
-from zbridge.control.context import Faults, RobotContext
+from zbridge.control.context import ProtocolFaults, RobotContext
 from zbridge.control.enforcer import SUSPENDED_S, Enforcer
 from zbridge.control.events import CommandSender, StopCause
-from zbridge.control.faults import Conditions
+from zbridge.control.faults import OpenFaults
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import Standstill
 from zbridge.errors import NeutralFirst, RateLimited
@@ -42,8 +42,8 @@ class Rig:
             KeySpace("fleet", "r1"),
             FakeBus(),
             self.metrics,
-            Conditions(),
-            Faults("r1"),
+            OpenFaults(),
+            ProtocolFaults("r1"),
             publish=lambda topic, message: self.shown.append(message),
             pump=lambda: None,
             clock=lambda: self.now,

@@ -1,7 +1,7 @@
 import pytest
 
 from zbridge.control.events import AuthorityEvent, EventKind, StopCause
-from zbridge.control.faults import EVENT_S, EVENTS, IN_A_ROW, INCIDENTS, SETTLE_S, Conditions, EventFaults, FaultCode
+from zbridge.control.faults import EVENT_S, EVENTS, IN_A_ROW, INCIDENTS, SETTLE_S, EventFaults, FaultCode, OpenFaults
 from zbridge.errors import Code
 from zbridge.fleet.messages import Latch
 
@@ -13,20 +13,20 @@ class Scene:
         self.now = 100.0
         self.changes = 0
         self.occurred: list[tuple[str, str]] = []
-        self.conditions = Conditions(self._changed, lambda: self.now, lambda: int(self.now * 1e9))
-        self.conditions.occurred = lambda code, text: self.occurred.append((code, text))
-        self.events = EventFaults(self.conditions, lambda: self.now)
+        self.open_faults = OpenFaults(self._changed, lambda: self.now, lambda: int(self.now * 1e9))
+        self.open_faults.occurred = lambda code, text: self.occurred.append((code, text))
+        self.events = EventFaults(self.open_faults, lambda: self.now)
 
     def _changed(self) -> None:
         self.changes += 1
 
     def after(self, seconds: float) -> None:
         self.now += seconds
-        self.conditions.expire()
+        self.open_faults.expire()
 
     @property
     def open(self) -> dict[str, int]:
-        return {fault.code: fault.count for fault in self.conditions.faults}
+        return {fault.code: fault.count for fault in self.open_faults.faults}
 
 
 @pytest.fixture
@@ -39,28 +39,28 @@ def refused(code: Code = Code.NOT_READY, who: str | None = "ann", command: str =
 
 
 def test_a_lasting_fault_opens_at_once_and_heals_when_its_cause_is_gone_for_long_enough(scene: Scene) -> None:
-    scene.conditions.set(FaultCode.LINK_STALLED, "takes nothing")
+    scene.open_faults.set(FaultCode.LINK_STALLED, "takes nothing")
     scene.after(3600.0)
-    assert (scene.open, scene.conditions.texts) == ({"link_stalled": 1}, ("takes nothing",))
-    scene.conditions.set(FaultCode.LINK_STALLED, None)
+    assert (scene.open, scene.open_faults.texts) == ({"link_stalled": 1}, ("takes nothing",))
+    scene.open_faults.set(FaultCode.LINK_STALLED, None)
     scene.after(SETTLE_S - 0.1)
-    assert (scene.open, scene.conditions.texts) == ({"link_stalled": 1}, ())
+    assert (scene.open, scene.open_faults.texts) == ({"link_stalled": 1}, ())
     scene.after(0.2)
     assert scene.open == {}
 
 
 def test_a_fault_that_flaps_opens_once_and_counts_its_occurrences(scene: Scene) -> None:
     for _ in range(20):
-        scene.conditions.set(FaultCode.LINK_STALLED, "takes nothing")
+        scene.open_faults.set(FaultCode.LINK_STALLED, "takes nothing")
         scene.after(1.0)
-        scene.conditions.set(FaultCode.LINK_STALLED, None)
+        scene.open_faults.set(FaultCode.LINK_STALLED, None)
         scene.after(1.0)
     assert scene.open == {"link_stalled": 20}
-    assert scene.conditions.counts == {FaultCode.LINK_STALLED: 1}
+    assert scene.open_faults.counts == {FaultCode.LINK_STALLED: 1}
     assert scene.occurred == [("link_stalled", "takes nothing")] * 20
     scene.after(SETTLE_S)
-    scene.conditions.set(FaultCode.LINK_STALLED, "takes nothing")
-    assert scene.conditions.counts == {FaultCode.LINK_STALLED: 2}
+    scene.open_faults.set(FaultCode.LINK_STALLED, "takes nothing")
+    assert scene.open_faults.counts == {FaultCode.LINK_STALLED: 2}
 
 
 def test_an_event_heals_by_itself_a_minute_after_it_happened_last(scene: Scene) -> None:
@@ -70,7 +70,7 @@ def test_an_event_heals_by_itself_a_minute_after_it_happened_last(scene: Scene) 
     scene.events.note(stopped)
     scene.after(EVENT_S - 1)
     assert scene.open == {"deadman": 2}
-    assert scene.conditions.texts == (), "it is no lasting condition"
+    assert scene.open_faults.texts == (), "it is no lasting condition"
     scene.after(1.1)
     assert scene.open == {}
 
@@ -144,10 +144,10 @@ def test_a_latch_of_before_this_process_is_a_fault_and_no_incident(scene: Scene)
 
 def test_a_change_is_told_once_and_a_quiet_one_not_at_all(scene: Scene) -> None:
     for _ in range(3):
-        scene.conditions.set(FaultCode.AUDIT_LOG, "disk full")
+        scene.open_faults.set(FaultCode.AUDIT_LOG, "disk full")
     assert scene.changes == 1
-    scene.conditions.set(FaultCode.ROBOT_LOST, "closed", quiet=True)
-    scene.conditions.set(FaultCode.ROBOT_LOST, None, quiet=True)
+    scene.open_faults.set(FaultCode.ROBOT_LOST, "closed", quiet=True)
+    scene.open_faults.set(FaultCode.ROBOT_LOST, None, quiet=True)
     assert scene.changes == 1
     scene.after(SETTLE_S)
     assert scene.changes == 2

@@ -9,7 +9,7 @@ from pathlib import Path
 import msgpack
 import pytest
 
-from zbridge.control.faults import Conditions
+from zbridge.control.faults import OpenFaults
 from zbridge.control.latch import Latches, LatchRecord
 from zbridge.control.latch_store import MOST_BYTES, LatchStore, state_folder
 from zbridge.fleet.messages import Latch
@@ -20,8 +20,8 @@ ANN = Latch(b"a" * 16, "ann", "wet floor")
 BOB = Latch(b"b" * 16, "bob", None, True)
 
 
-def store(folder: Path, conditions: Conditions | None = None) -> LatchStore:
-    return LatchStore(KEYS, conditions or Conditions(), folder)
+def store(folder: Path, open_faults: OpenFaults | None = None) -> LatchStore:
+    return LatchStore(KEYS, open_faults or OpenFaults(), folder)
 
 
 def latches(*those: Latch) -> Latches:
@@ -95,16 +95,16 @@ async def test_a_file_that_is_a_folder_cannot_be_read_either(folder: Path) -> No
 async def test_what_cannot_be_written_is_said_and_tried_again(tmp_path: Path) -> None:
     in_the_way = tmp_path / "zbridge"
     in_the_way.write_text("no folder")
-    conditions, made = Conditions(), latches(ANN)
-    kept = store(in_the_way, conditions)
+    open_faults, made = OpenFaults(), latches(ANN)
+    kept = store(in_the_way, open_faults)
     kept.save(made)
     await kept.flush()
-    (text,) = conditions.texts
+    (text,) = open_faults.texts
     assert text.startswith(f"latched stops do not survive a restart: {in_the_way}")
     in_the_way.unlink()
     kept.save(made)
     await kept.flush()
-    assert conditions.texts == ()
+    assert open_faults.texts == ()
     assert store(in_the_way).load().in_force == (ANN,)
 
 
@@ -160,7 +160,7 @@ async def test_a_file_of_an_earlier_version_says_nothing_of_motion_by_itself(fol
 
 async def test_names_of_other_robots_and_realms_never_meet(folder: Path) -> None:
     for number, keys in enumerate((KeySpace("a.b", "c"), KeySpace("a", "b.c"), KeySpace("..", ".."))):
-        kept = LatchStore(keys, Conditions(), folder)
+        kept = LatchStore(keys, OpenFaults(), folder)
         assert not kept.load()
         kept.save(latches(Latch(bytes([number]) * 16)))
         await kept.flush()

@@ -35,8 +35,8 @@ from zbridge.bus import Handle, IncomingQuery, PriorityClass, Sample
 from zbridge.bus.interface import Sort
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
-from zbridge.control.context import Faults, RobotContext
-from zbridge.control.faults import Conditions
+from zbridge.control.context import ProtocolFaults, RobotContext
+from zbridge.control.faults import OpenFaults
 from zbridge.control.latch import Latches
 from zbridge.errors import LinkError
 from zbridge.fleet import topics
@@ -205,8 +205,8 @@ class Rig:
                 KeySpace("fleet", "r1"),
                 self.bus,
                 self.metrics,
-                Conditions(),
-                Faults("r1"),
+                OpenFaults(),
+                ProtocolFaults("r1"),
                 clock=self.loop.time,
                 clock_ns=lambda: 1234,
                 **{clock: more.pop(clock) for clock in ("raw_ms", "suspended_s") if clock in more},

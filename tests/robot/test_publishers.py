@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.fake_bus import FakeBus
-from zbridge.control.faults import Conditions
+from zbridge.control.faults import OpenFaults
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Reading, Switch
 from zbridge.fleet.topics import KeySpace
@@ -16,9 +16,9 @@ from zbridge.robot.publishers import RobotPublishers
 class Rig:
     def __init__(self) -> None:
         self.bus = FakeBus()
-        self.conditions = Conditions()
+        self.open_faults = OpenFaults()
         self.now = 0.0
-        self.publishers = RobotPublishers(self.bus, KeySpace("fleet", "r1"), self.conditions, lambda: self.now)
+        self.publishers = RobotPublishers(self.bus, KeySpace("fleet", "r1"), self.open_faults, lambda: self.now)
 
     def read(self, name: str) -> None:
         self.publishers.publish(topics.SENSOR(name), Reading(1.0))
@@ -40,7 +40,7 @@ def test_names_above_the_bound_are_dropped_and_shown_until_the_hour_since_the_fi
     assert len(rig.publishers) == 2, "one for each topic"
     for rig.now, over in ((names.HOUR_S + 9.9, True), (names.HOUR_S + 10.0, False)):
         rig.publishers.expire()
-        assert bool(rig.conditions.texts) is over, "status says so"
+        assert bool(rig.open_faults.texts) is over, "status says so"
     rig.read("c")
     assert rig.shown("sensor/c") == 1
 

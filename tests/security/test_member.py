@@ -13,7 +13,7 @@ from tests.fake_bus import FakeBus
 from zbridge.app.config import GatewayPlan, load
 from zbridge.app.joining import ENDED_S, RARELY_S, RETRY_S, CertificateEnded, Pauses, watch_certificate
 from zbridge.bus.tls.certificate import Certificate
-from zbridge.control.faults import Conditions
+from zbridge.control.faults import OpenFaults
 from zbridge.errors import BusError, BusRefused, ConfigError
 from zbridge.security.certs import authority
 from zbridge.security.certs.authority import CertificateRequest
@@ -114,21 +114,21 @@ def test_after_refusals_a_gateway_tries_rarely_and_no_two_together() -> None:
 async def test_the_end_of_a_certificate_shows_on_status_and_once_a_day_in_the_log(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    loop, conditions = asyncio.get_running_loop(), Conditions()
+    loop, open_faults = asyncio.get_running_loop(), OpenFaults()
     start = loop.time()
     certificate, bus = Certificate("gateway.g1", NOW, NOW + timedelta(days=32)), FakeBus()
     caplog.set_level(logging.WARNING)
     watching = asyncio.create_task(
-        watch_certificate(certificate, bus, conditions, lambda: NOW + timedelta(seconds=loop.time() - start))
+        watch_certificate(certificate, bus, open_faults, lambda: NOW + timedelta(seconds=loop.time() - start))
     )
     await asyncio.sleep(timedelta(days=1.9).total_seconds())
-    assert (conditions.texts, caplog.messages) == ((), [])
+    assert (open_faults.texts, caplog.messages) == ((), [])
     await asyncio.sleep(timedelta(days=3).total_seconds())
-    (text,) = conditions.texts
+    (text,) = open_faults.texts
     assert text.startswith("the certificate of gateway.g1 ends on ")
     assert caplog.messages == [text] * 3
     await asyncio.sleep(timedelta(days=28).total_seconds())
-    assert "expired on" in conditions.texts[0]
+    assert "expired on" in open_faults.texts[0]
     assert not watching.done()  # nothing has closed the connection
     bus.connection(False)
     await asyncio.sleep(2 * ENDED_S)

@@ -73,8 +73,8 @@ FOUND = (
     _mutant(
         "a gateway that is gone is shown for ever",
         "zbridge/app/serving.py",
-        "        self._conditions.set(_RIVALS, text if claims else None)\n",
-        "        if claims:\n            self._conditions.set(_RIVALS, text)\n",
+        "        self._open_faults.set(_RIVALS, text if claims else None)\n",
+        "        if claims:\n            self._open_faults.set(_RIVALS, text)\n",
     ),
     _mutant(
         "a stop is one of the wheels only",
@@ -128,7 +128,7 @@ FOUND = (
     _mutant(
         "a connection that ended while it was stalled blocks the next one",
         PRESENCE,
-        '        self._commands.blocked = False\n        self._context.conditions.set("link", None)\n',
+        '        self._commands.blocked = False\n        self._context.open_faults.set("link", None)\n',
         "",
     ),
     _mutant(

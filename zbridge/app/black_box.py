@@ -17,7 +17,7 @@ from zbridge.blackbox import BlackBox, BlackBoxSettings, BoxFolder
 from zbridge.blackbox.reading import list_incidents, read_part
 from zbridge.bus import Bus, Handle, IncomingQuery
 from zbridge.control.admission import NameFilter
-from zbridge.control.faults import Conditions, FaultCode
+from zbridge.control.faults import FaultCode, OpenFaults
 from zbridge.control.latch_store import state_folder
 from zbridge.errors import Malformed, NotReady, PayloadError, Refused, ZbridgeError, describe
 from zbridge.fleet import payload as payloads
@@ -42,7 +42,7 @@ def box_folder(settings: BlackBoxSettings, state: Path | None = None) -> Path:
 
 @contextlib.contextmanager
 def open_black_box(
-    plan: GatewayPlan, keys: KeySpace, conditions: Conditions, state: Path | None, *, alone: bool
+    plan: GatewayPlan, keys: KeySpace, open_faults: OpenFaults, state: Path | None, *, alone: bool
 ) -> Iterator[BlackBox | None]:
     """Yield the black box of a gateway, which is to be begun; None without ``[blackbox]``.
 
@@ -61,25 +61,25 @@ def open_black_box(
             "versions": {"zbridge": __version__, "python": platform.python_version(), "protocol": protocol},
             "configuration": plan.written,
         },
-        tell=lambda text: conditions.set(FaultCode.BLACK_BOX, text),
-        died=lambda text: _died(conditions, text),
+        tell=lambda text: open_faults.set(FaultCode.BLACK_BOX, text),
+        died=lambda text: _died(open_faults, text),
         alone=alone,
     )
-    conditions.occurred = lambda code, text: box.keep(code, text, died=code in _OF_THE_PROCESS_BEFORE)
+    open_faults.occurred = lambda code, text: box.keep(code, text, died=code in _OF_THE_PROCESS_BEFORE)
     try:
         yield box
     except Exception as error:
         box.close(error if not isinstance(error, ZbridgeError) else None)
         raise
     finally:
-        conditions.occurred = lambda code, text: None
+        open_faults.occurred = lambda code, text: None
         box.close()
 
 
-def _died(conditions: Conditions, text: str) -> None:
+def _died(open_faults: OpenFaults, text: str) -> None:
     """Note the end of the process before this one, unless the supervisor said why it ended."""
-    if not any(fault.code in _OF_THE_PROCESS_BEFORE for fault in conditions.faults):
-        conditions.happened(FaultCode.GATEWAY_DIED, text)
+    if not any(fault.code in _OF_THE_PROCESS_BEFORE for fault in open_faults.faults):
+        open_faults.happened(FaultCode.GATEWAY_DIED, text)
 
 
 class BoxServer:

@@ -31,8 +31,8 @@ from zbridge.bus import Bus, Handle, IncomingQuery
 from zbridge.bus.tls.files import own_certificate, own_name
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
-from zbridge.control.context import Faults, RobotContext
-from zbridge.control.faults import Conditions, FaultCode
+from zbridge.control.context import ProtocolFaults, RobotContext
+from zbridge.control.faults import FaultCode, OpenFaults
 from zbridge.control.latch_store import LatchStore
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.errors import ZbridgeError, describe
@@ -81,10 +81,10 @@ class Neighbourhood(msgspec.Struct, frozen=True):
 class Gateway:
     """A gateway of one robot: its device side, its listeners, or both, as the plan says.
 
-    metrics, sessions, conditions: of this gateway, shared by all parts. observer: a supervisor, notified of the robot's
-    links. predecessor: the channel to the gateway that hands over to this one. successor: starts the process that this
-    one hands over to. runtime: clocks, processes and sockets of the machine. died: how the process before this one
-    ended, if it did not end in order.
+    metrics, sessions, open_faults: of this gateway, shared by all parts. observer: a supervisor, notified of the
+    robot's links. predecessor: the channel to the gateway that hands over to this one. successor: starts the process
+    that this one hands over to. runtime: clocks, processes and sockets of the machine. died: how the process before
+    this one ended, if it did not end in order.
     """
 
     def __init__(
@@ -117,7 +117,7 @@ class Gateway:
         """Whether the bus was closed in order; if not, one of its threads may hang."""
         self.metrics = metrics or robot_metrics(plan, Metrics())
         self.sessions = SessionTable()
-        self.conditions = Conditions(clock=runtime.clock, clock_ns=runtime.clock_ns)
+        self.open_faults = OpenFaults(clock=runtime.clock, clock_ns=runtime.clock_ns)
         self._own = own_name(plan.config.bus.tls)
         """The name in our certificate."""
         self._process = "gateway"
@@ -167,8 +167,8 @@ class Gateway:
         """Open what the gateway writes: the audit log, and the black box. alone: the process serves this robot only."""
         folder = self._runtime.folder
         with (
-            open_audit(self._plan, self.metrics, self.conditions) as audit,
-            open_black_box(self._plan, self._keys, self.conditions, folder, alone=alone) as self._box,
+            open_audit(self._plan, self.metrics, self.open_faults) as audit,
+            open_black_box(self._plan, self._keys, self.open_faults, folder, alone=alone) as self._box,
         ):
             yield audit
 
@@ -191,7 +191,7 @@ class Gateway:
                 robot.open()
                 stack.callback(robot.close)
             if certificate is not None:
-                work.append(watch_certificate(certificate, bus, self.conditions))
+                work.append(watch_certificate(certificate, bus, self.open_faults))
             if self._plan.device is not None:
                 work.append(self._robot(bus, audit, self._plan.device))
             else:
@@ -241,7 +241,7 @@ class Gateway:
         yield from session_readings(self.sessions)
         if self._plan.device is not None:
             yield from robot_readings(self.restarts.device, self._plan.device.protocol.name)
-            yield from fault_readings(self.conditions)
+            yield from fault_readings(self.open_faults)
             yield from self._box.readings() if self._box is not None else ()
 
     def missing(self) -> tuple[str, ...]:
@@ -257,7 +257,7 @@ class Gateway:
 
     async def _robot(self, bus: Bus, audit: Audit, plan: DevicePlan) -> None:
         """Serve the robot whenever no other gateway does."""
-        store = LatchStore(self._keys, self.conditions, self._runtime.folder)
+        store = LatchStore(self._keys, self.open_faults, self._runtime.folder)
         store.load()  # the gateway that serves the robot is sent its contents
         clock, chance = self._runtime.clock, self._runtime.chance
         ownership = Ownership(
@@ -315,7 +315,7 @@ class Gateway:
         if self._plan.camera is not None:
             from zbridge.camera.camera import Camera
 
-            camera = Camera(self._plan.camera, self._keys, bus, self.metrics, self.conditions).run
+            camera = Camera(self._plan.camera, self._keys, bus, self.metrics, self.open_faults).run
 
         def show() -> tuple[Handle, ...]:
             stats = StatsPublisher(bus, self._keys, self._stats)
@@ -323,7 +323,7 @@ class Gateway:
             return (self._show_sessions(bus, "gateway"), self.restarts.answer(bus), stats, *box)
 
         self._serving = Serving(
-            self._keys.robot, device, ownership, store, self.conditions, show, camera, self._runtime.clock
+            self._keys.robot, device, ownership, store, self.open_faults, show, camera, self._runtime.clock
         )
 
         if begin is None:  # else this process may still be given up for the one before it
@@ -343,7 +343,7 @@ class Gateway:
             self._box.begin()
         died, self._died = self._died, None
         if died is not None:
-            self.conditions.happened(*died)
+            self.open_faults.happened(*died)
 
     def _authority(self, store: LatchStore) -> Authority:
         control, bus = self._plan.config.control, self._plan.config.bus
@@ -367,8 +367,8 @@ class Gateway:
                 self._keys,
                 bus,
                 self.metrics,
-                self.conditions,
-                Faults(self._keys.robot),
+                self.open_faults,
+                ProtocolFaults(self._keys.robot),
                 clock=runtime.clock,
                 clock_ns=runtime.clock_ns,
                 raw_ms=runtime.raw_ms,

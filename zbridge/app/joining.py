@@ -20,7 +20,7 @@ from zbridge.app.config import GatewayPlan
 from zbridge.bus import OPEN_S, Bus, open_bus
 from zbridge.bus.tls.certificate import Certificate
 from zbridge.bus.tls.files import ends_soon, utc_now
-from zbridge.control.faults import Conditions, FaultCode
+from zbridge.control.faults import FaultCode, OpenFaults
 from zbridge.errors import BusError, BusRefused
 from zbridge.fleet import topics
 from zbridge.log import Log
@@ -147,7 +147,7 @@ async def watch_session(plan: GatewayPlan, bus: Bus, can_connect: Callable[[Gate
 
 
 async def watch_certificate(
-    certificate: Certificate, bus: Bus, conditions: Conditions, now: Callable[[], datetime] = utc_now
+    certificate: Certificate, bus: Bus, open_faults: OpenFaults, now: Callable[[], datetime] = utc_now
 ) -> None:
     """Warn on ``status`` and in the log from 30 days before a certificate ends.
 
@@ -163,7 +163,7 @@ async def watch_certificate(
     bus.watch_connected(connected)
     while True:
         text = ends_soon(certificate, now())
-        conditions.set(FaultCode.CERTIFICATE, text)
+        open_faults.set(FaultCode.CERTIFICATE, text)
         if text is not None and (text != logged or loop.time() - logged_at >= LOG_S):
             logged, logged_at = text, loop.time()
             log.warning("certificate_ends", "{reason}", reason=text)

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any, get_args
 
-from zbridge.control.faults import Conditions, FaultCode
+from zbridge.control.faults import FaultCode, OpenFaults
 from zbridge.fleet.messages import RobotState
 from zbridge.metrics import OTHER, Histogram, Metrics, Reading
 from zbridge.protocol.session import Role, Session
@@ -55,12 +55,12 @@ def robot_readings(device: RobotDevice | None, protocol: str) -> Iterator[Readin
     yield "latches", {}, len(authority.latches.in_force)
 
 
-def fault_readings(conditions: Conditions) -> Iterator[Reading]:
+def fault_readings(open_faults: OpenFaults) -> Iterator[Reading]:
     """Read which faults are open, and how often each has opened."""
-    opened = {fault.code for fault in conditions.faults}
+    opened = {fault.code for fault in open_faults.faults}
     for code in FaultCode:
         yield "fault_open", {"code": code}, int(code in opened)
-        yield "faults", {"code": code}, conditions.counts[code]
+        yield "faults", {"code": code}, open_faults.counts[code]
 
 
 class LoopLateness:

@@ -20,7 +20,7 @@ from zbridge.app.process_usage import USAGE, ProcessUsage
 from zbridge.bus import Bus
 from zbridge.clocks import Clocks
 from zbridge.control.audit_log import Audit, AuditFile
-from zbridge.control.faults import Conditions, FaultCode
+from zbridge.control.faults import FaultCode, OpenFaults
 from zbridge.log import Log
 from zbridge.metrics import Metrics
 from zbridge.transport.kernel import KERNEL, Kernel
@@ -51,7 +51,7 @@ RUNTIME = Runtime()
 
 
 @contextlib.contextmanager
-def open_audit(plan: GatewayPlan, metrics: Metrics, conditions: Conditions) -> Iterator[Audit]:
+def open_audit(plan: GatewayPlan, metrics: Metrics, open_faults: OpenFaults) -> Iterator[Audit]:
     """Open the audit log: the file that the configuration names, else the process's log at DEBUG."""
     control, name = plan.config.control, plan.config.robot.name
     if control.audit is None or plan.device is None:
@@ -61,7 +61,7 @@ def open_audit(plan: GatewayPlan, metrics: Metrics, conditions: Conditions) -> I
 
     def report(text: str | None) -> None:
         with contextlib.suppress(RuntimeError):  # the loop has ended
-            loop.call_soon_threadsafe(conditions.set, FaultCode.AUDIT_LOG, text)
+            loop.call_soon_threadsafe(open_faults.set, FaultCode.AUDIT_LOG, text)
 
     file = AuditFile(
         Path(control.audit),

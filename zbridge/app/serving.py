@@ -14,7 +14,7 @@ from collections.abc import Awaitable, Callable, Coroutine, Iterable, Mapping
 from typing import Any
 
 from zbridge.bus import Handle
-from zbridge.control.faults import Conditions, FaultCode
+from zbridge.control.faults import FaultCode, OpenFaults
 from zbridge.control.latch import LatchRecord
 from zbridge.control.latch_store import LatchStore
 from zbridge.errors import Held
@@ -48,7 +48,7 @@ class Serving:
         device: RobotDevice,
         ownership: Ownership,
         store: LatchStore,
-        conditions: Conditions,
+        open_faults: OpenFaults,
         show: Callable[[], Iterable[Handle]],
         camera: Callable[[], Coroutine[Any, Any, None]] | None = None,
         clock: Callable[[], float] = time.monotonic,
@@ -58,7 +58,7 @@ class Serving:
         self._device = device
         self._ownership = ownership
         self._store = store
-        self._conditions = conditions
+        self._open_faults = open_faults
         self._show = show
         self._camera = camera
         self._shown: list[Handle] = []
@@ -90,7 +90,7 @@ class Serving:
             for task in tasks:
                 task.cancel()
             await asyncio.shield(asyncio.gather(*tasks, self._close(), return_exceptions=True))
-            self._conditions.set(FaultCode.SPLIT_CLAIMS, None)
+            self._open_faults.set(FaultCode.SPLIT_CLAIMS, None)
 
     # What the ownership calls
 
@@ -110,7 +110,7 @@ class Serving:
             owners = [claim.record for claim in claims.values() if not claim.yielded]
             self._owners_record = owners[0] if owners else self._owners_record
             self._store.mirror(self._owners_record)
-            self._conditions.set(FaultCode.SPLIT_CLAIMS, None)
+            self._open_faults.set(FaultCode.SPLIT_CLAIMS, None)
             return
         for claim in claims.values():
             self._device.enforcer.merge(claim.record)
@@ -158,7 +158,7 @@ class Serving:
         text = f"another gateway serves this robot too: {', '.join(zids[:_LISTED])}{more}"
         if claims and not zids:
             text = SECOND_CONNECTION
-        self._conditions.set(FaultCode.SPLIT_CLAIMS, text if claims else None)
+        self._open_faults.set(FaultCode.SPLIT_CLAIMS, text if claims else None)
         if claims and self._clock() - self._logged_at >= LOG_S:
             self._logged_at = self._clock()
             log.error("robot_contested", "{robot}: {reason}", robot=self._robot, reason=text)

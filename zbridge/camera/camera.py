@@ -18,7 +18,7 @@ from zbridge.camera.pace import Pace
 from zbridge.camera.relay import Latest, Relay
 from zbridge.camera.settings import CameraPlan
 from zbridge.camera.upstream import fetch
-from zbridge.control.faults import Conditions, FaultCode
+from zbridge.control.faults import FaultCode, OpenFaults
 from zbridge.errors import LinkError, ProtocolError, describe
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -38,7 +38,7 @@ RETRY_S = 5.0
 
 
 class Camera:
-    """One camera; ``run`` serves it. conditions: what ``status`` shows. clock_ns: Unix time, for stamps."""
+    """One camera; ``run`` serves it. open_faults: what ``status`` shows. clock_ns: Unix time, for stamps."""
 
     def __init__(
         self,
@@ -46,13 +46,13 @@ class Camera:
         keys: KeySpace,
         bus: Bus,
         metrics: Metrics,
-        conditions: Conditions,
+        open_faults: OpenFaults,
         clock_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         self._plan = plan
         self._key = keys.key(topics.IMAGE.path)
         self._bus = bus
-        self._conditions = conditions
+        self._open_faults = open_faults
         self._clock_ns = clock_ns
         self._loop = asyncio.get_running_loop()
         self.demand = demand = Demand()
@@ -62,7 +62,7 @@ class Camera:
         self._relay: Relay | None = None
         if plan.relay is not None:
             self._relay = Relay(
-                plan, plan.relay, demand, latest, metrics, lambda text: conditions.set(FaultCode.CAMERA_RELAY, text)
+                plan, plan.relay, demand, latest, metrics, lambda text: open_faults.set(FaultCode.CAMERA_RELAY, text)
             )
         self._publisher = bus.publisher(self._key, topics.IMAGE)
         self._pace: Pace[tuple[MjpegPart, int]] = Pace(plan.settings.rate_hz)
@@ -88,14 +88,14 @@ class Camera:
             watch.close()
             self._publisher.close()
             for code in (FaultCode.CAMERA, FaultCode.CAMERA_RELAY):
-                self._conditions.set(code, None)
+                self._open_faults.set(code, None)
 
     async def _follow(self) -> None:
         """Fetch the stream whenever somebody watches."""
         backoff = Backoff(most_s=RETRY_S)
         while True:
             if not self.demand.wanted:
-                self._conditions.set(FaultCode.CAMERA, None)
+                self._open_faults.set(FaultCode.CAMERA, None)
             await self.demand.begin()
             begun = self._loop.time()
             reason = await self._fetch()
@@ -109,7 +109,7 @@ class Camera:
             delay_s = backoff.delay_s()
             template = "camera {source}: {reason}; next attempt in {delay_s:.1f} s"
             log.info("camera_lost", template, source=self._plan.source, reason=reason, delay_s=delay_s)
-            self._conditions.set(FaultCode.CAMERA, f"camera {self._plan.source}: {reason}")
+            self._open_faults.set(FaultCode.CAMERA, f"camera {self._plan.source}: {reason}")
             await asyncio.sleep(delay_s)
 
     async def _fetch(self) -> str | None:
@@ -133,7 +133,7 @@ class Camera:
         if not parts:
             return
         self._pictures.value += len(parts)
-        self._conditions.set(FaultCode.CAMERA, None)
+        self._open_faults.set(FaultCode.CAMERA, None)
         for part in parts:
             self.latest.show(stream, part)
         if self.demand.listened:

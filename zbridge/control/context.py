@@ -10,7 +10,7 @@ import msgspec
 from zbridge.blackbox import BlackBox
 from zbridge.bus import Bus
 from zbridge.clocks import raw_ms, suspended_s
-from zbridge.control.faults import Conditions
+from zbridge.control.faults import OpenFaults
 from zbridge.errors import FAULT, Unsupported, describe
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import KeySpace, Topic
@@ -24,7 +24,7 @@ LOGGED = 16
 """Faults that are logged, each once."""
 
 
-class Faults:
+class ProtocolFaults:
     """Exceptions in the code of one robot's protocol, as refusals. robot: its name, for the log."""
 
     def __init__(self, robot: str) -> None:
@@ -32,7 +32,7 @@ class Faults:
         self._logged: set[str] = set()
 
     def __repr__(self) -> str:
-        return f"<Faults {sorted(self._logged)}>"
+        return f"<ProtocolFaults {sorted(self._logged)}>"
 
     def refusal(self, what: str, error: Exception) -> Unsupported:
         """Return the refusal of what ran into a fault, and note the fault."""
@@ -62,8 +62,8 @@ class RobotContext(msgspec.Struct, frozen=True):
     keys: KeySpace
     bus: Bus
     metrics: Metrics
-    conditions: Conditions
-    faults: Faults
+    open_faults: OpenFaults
+    faults: ProtocolFaults
     clock: Callable[[], float]
     clock_ns: Callable[[], int] = time.time_ns
     raw_ms: Callable[[], float] = raw_ms

@@ -85,7 +85,7 @@ class Enforcer:
         self._control_due: asyncio.TimerHandle | None = None
         self._closed = False
         self._counts = EventCounts(context.metrics)
-        self._faults = EventFaults(context.conditions, context.clock)
+        self._faults = EventFaults(context.open_faults, context.clock)
         self._faults.latched(authority.latches.in_force, anew=False)
         self._same_stops = context.metrics.count("stops_folded")
         self._slowed = context.metrics.count("drives_slowed")

@@ -3,8 +3,8 @@
 Theory of operation. A *lasting* fault is set by the part that finds it, and cleared by the same part. An *event* is
 over when it is noted; its fault heals by itself, :data:`EVENT_S` after the last occurrence. A fault that returns within
 :data:`SETTLE_S` of its end is the same one: it is shown and counted once, with the number of its occurrences. Every
-occurrence of a fault that is an incident is reported to :attr:`Conditions.occurred`, so that the minutes before are
-kept. ``status`` shows the open faults; :meth:`Conditions.expire` must be called about once a second.
+occurrence of a fault that is an incident is reported to :attr:`OpenFaults.occurred`, so that the minutes before are
+kept. ``status`` shows the open faults; :meth:`OpenFaults.expire` must be called about once a second.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ class _OpenFault(msgspec.Struct):
     heals_at: float | None = None
 
 
-class Conditions:
+class OpenFaults:
     """The open faults of one robot.
 
     changed: called when a fault opens, heals or has another text. clock: seconds; clock_ns: Unix time.
@@ -132,7 +132,7 @@ class Conditions:
         self._open: dict[FaultCode, _OpenFault] = {}
 
     def __repr__(self) -> str:
-        return f"<Conditions {[str(code) for code in self._open]}>"
+        return f"<OpenFaults {[str(code) for code in self._open]}>"
 
     @property
     def texts(self) -> tuple[str, ...]:
@@ -199,8 +199,8 @@ class Conditions:
 class EventFaults:
     """Finds faults in the events of one robot's authority. clock: seconds."""
 
-    def __init__(self, conditions: Conditions, clock: Callable[[], float]) -> None:
-        self._conditions = conditions
+    def __init__(self, open_faults: OpenFaults, clock: Callable[[], float]) -> None:
+        self._open_faults = open_faults
         self._clock = clock
         self._refused = 0
         self._refused_at = 0.0
@@ -214,7 +214,7 @@ class EventFaults:
             self._note_refusal(event)
         elif event.cause in _OF_CAUSES:
             who = f" ({event.who})" if event.who else ""
-            self._conditions.happened(_OF_CAUSES[event.cause], f"{event.reason or event.cause}{who}")
+            self._open_faults.happened(_OF_CAUSES[event.cause], f"{event.reason or event.cause}{who}")
 
     def moved(self) -> None:
         """Note that motion was carried out: no row of refusals goes on."""
@@ -223,7 +223,7 @@ class EventFaults:
     def latched(self, latches: tuple[Latch, ...], *, anew: bool = True) -> None:
         """Note the latched stops in force."""
         text = ", ".join(latch.described for latch in latches)
-        self._conditions.set(FaultCode.LATCHED, text or None, anew=anew)
+        self._open_faults.set(FaultCode.LATCHED, text or None, anew=anew)
 
     def _note_refusal(self, event: AuthorityEvent) -> None:
         is_motion = event.command is not None and event.command.startswith(("drive", "motor"))
@@ -236,4 +236,4 @@ class EventFaults:
             self._refused = 0
             code = FaultCode.STALE_COMMANDS if event.code is Code.STALE else FaultCode.REFUSED_MOTION
             text = f"{IN_A_ROW} commands of {event.who} in a row were refused: {event.reason}"
-            self._conditions.happened(code, text)
+            self._open_faults.happened(code, text)

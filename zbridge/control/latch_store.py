@@ -19,7 +19,7 @@ from pathlib import Path
 
 import msgspec
 
-from zbridge.control.faults import Conditions, FaultCode
+from zbridge.control.faults import FaultCode, OpenFaults
 from zbridge.control.latch import Latches, LatchRecord
 from zbridge.fleet.messages import Latch
 from zbridge.fleet.topics import KeySpace
@@ -46,12 +46,12 @@ def state_folder(environment: Mapping[str, str] = os.environ) -> Path:
 
 
 class LatchStore:
-    """The files of one robot. conditions: show on ``status`` that nothing can be kept."""
+    """The files of one robot. open_faults: show on ``status`` that nothing can be kept."""
 
-    def __init__(self, keys: KeySpace, conditions: Conditions, folder: Path | None = None) -> None:
+    def __init__(self, keys: KeySpace, open_faults: OpenFaults, folder: Path | None = None) -> None:
         folder = folder if folder is not None else state_folder()
         self._own, self._standby = (folder / f"{keys.realm}@{keys.robot}.{kind}" for kind in (_OWN, _STANDBY))
-        self._conditions = conditions
+        self._open_faults = open_faults
         self.known = Latches()
         """What could be read, and what the gateway that owns the robot said since; after :meth:`load`."""
         self._written: dict[Path, LatchRecord] = {}
@@ -134,16 +134,16 @@ class LatchStore:
                 except OSError as error:
                     self._fail(path, error)
                 else:
-                    self._conditions.set(FaultCode.LATCH_FILE, None)
+                    self._open_faults.set(FaultCode.LATCH_FILE, None)
         finally:
             self._writing = None
 
     def _fail(self, path: Path, error: OSError) -> None:
         self._written.pop(path, None)  # so that it is tried again
         text = f"latched stops do not survive a restart: {path}: {error.strerror or error}"
-        if text not in self._conditions.texts:
+        if text not in self._open_faults.texts:
             log.error("latch_not_written", "{reason}", reason=text, file=path)
-        self._conditions.set(FaultCode.LATCH_FILE, text)
+        self._open_faults.set(FaultCode.LATCH_FILE, text)
 
 
 def _write(path: Path, data: bytes) -> None:

@@ -78,9 +78,9 @@ class Standstill:
         try:
             self._write(now, until)
         except Refused as refusal:
-            self._context.conditions.set(FaultCode.CANNOT_STOP, f"cannot be stopped: {refusal}")
+            self._context.open_faults.set(FaultCode.CANNOT_STOP, f"cannot be stopped: {refusal}")
             raise
-        self._context.conditions.set(FaultCode.CANNOT_STOP, None)
+        self._context.open_faults.set(FaultCode.CANNOT_STOP, None)
         self._context.pump()
 
     def _write(self, now: float, until: float) -> None:
@@ -95,7 +95,7 @@ class Standstill:
         self.begin()
         session, now = self._context.robot.driving, self._clock()
         if session is None or session.state is not State.ESTABLISHED:
-            self._context.conditions.set(FaultCode.CANNOT_STOP, None)
+            self._context.open_faults.set(FaultCode.CANNOT_STOP, None)
         elif (
             (self._idle_stop_s or self._authority.latches)
             and not self._authority.motion.driven

@@ -26,7 +26,7 @@ from zbridge.blackbox import DISK
 from zbridge.blackbox.box import CLOSE_S
 from zbridge.bus import Bus
 from zbridge.bus.tls.files import own_certificate
-from zbridge.control.faults import Conditions
+from zbridge.control.faults import OpenFaults
 from zbridge.errors import ZbridgeError
 from zbridge.host.addresses import hold_addresses
 from zbridge.host.settings import HostSettings
@@ -106,7 +106,7 @@ class Together:
             for number, (name, plan) in enumerate(self._plans.items()):
                 self.start(name, plan, (number + random.random()) * self._host.stagger_s)
             if certificate is not None:
-                watches.append(watch_certificate(certificate, bus, Conditions()))
+                watches.append(watch_certificate(certificate, bus, OpenFaults()))
             if settings.effective_mode == "client":
                 watches.append(watch_session(any_plan, bus, can_connect))
             if watches:

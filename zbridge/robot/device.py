@@ -91,8 +91,8 @@ class RobotDevice(Transferable):
         self._declared: list[Handle] = []
         self._on_demand: list[OnDemand] = []
         self._observer = watching = observer or Observer()  # a plain Observer ignores everything
-        bus, keys, conditions = context.bus, context.keys, context.conditions
-        self.publishers = RobotPublishers(bus, keys, conditions, context.clock, watching.published, context.box)
+        bus, keys, open_faults = context.bus, context.keys, context.open_faults
+        self.publishers = RobotPublishers(bus, keys, open_faults, context.clock, watching.published, context.box)
         self._links = links = Links()
         publish = self.publishers.publish
         self._context = context = msgspec.structs.replace(context, publish=publish, pump=links.pump)  # now complete
@@ -111,7 +111,7 @@ class RobotDevice(Transferable):
         self._presence = Presence(
             context, protocol, links, enforcer, self._standstill, self._commands, pending, watching
         )
-        conditions.changed = self._presence.publish_status
+        open_faults.changed = self._presence.publish_status
         hooks = self._hooks(settings, observer)
         for name, address in zip(context.robot.link_names, settings.addresses, strict=True):
             links.add(Connection(name, f"{keys.robot} {name}", address, settings, hooks))
@@ -206,7 +206,7 @@ class RobotDevice(Transferable):
         while True:
             await asyncio.sleep(HEARTBEAT_S)
             self.publishers.expire()
-            self._context.conditions.expire()
+            self._context.open_faults.expire()
             if self._commanded:  # else another gateway, or the next process, says it
                 self._presence.publish_status()
                 self.enforcer.beat()
@@ -372,7 +372,7 @@ class RobotDevice(Transferable):
         self._detached.set()
         self._standstill.close()
         self.enforcer.close()
-        self._context.conditions.changed = lambda: None
+        self._context.open_faults.changed = lambda: None
         for connection in self._links:
             connection.detach()
 
@@ -392,7 +392,7 @@ class RobotDevice(Transferable):
         with contextlib.suppress(BusError, TimeoutError):
             async with asyncio.timeout(FLUSH_S):
                 await self._context.bus.flush()
-        self._context.conditions.changed = lambda: None
+        self._context.open_faults.changed = lambda: None
         for handle in (*self._commanded, *self._on_demand, *self._declared):
             handle.close()
         self.publishers.close()

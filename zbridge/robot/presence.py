@@ -101,7 +101,7 @@ class Presence:
         if name != self._links.first.name:
             return
         self._commands.blocked = stalled
-        self._context.conditions.set(FaultCode.LINK_STALLED, f"{LINK_BLOCKED}: it is not driven" if stalled else None)
+        self._context.open_faults.set(FaultCode.LINK_STALLED, f"{LINK_BLOCKED}: it is not driven" if stalled else None)
         if stalled:
             self._stalls.value += 1
             log.warning("link_stalled", "{robot}: {reason}", robot=self._context.keys.robot, reason=LINK_BLOCKED)
@@ -119,7 +119,7 @@ class Presence:
         session = context.robot.driving
         agreed = session if session is not None and first.state == "established" else None
         self._shown_doubts = agreed.doubts if agreed is not None else ()
-        reasons = (first.reason, *self._shown_doubts, *context.conditions.texts)
+        reasons = (first.reason, *self._shown_doubts, *context.open_faults.texts)
         context.publish(
             topics.STATUS,
             Status(
@@ -134,24 +134,24 @@ class Presence:
                 host=self._host,
                 stalled=self._commands.blocked or UNSET,
                 commands=("stop", *context.robot.accepts) if agreed is not None and agreed.busy is None else (),
-                faults=context.conditions.faults,
+                faults=context.open_faults.faults,
             ),
         )
 
     def _on_lost(self, session: Session[Any]) -> None:
         self._commands.blocked = False
-        self._context.conditions.set(FaultCode.LINK_STALLED, None)
+        self._context.open_faults.set(FaultCode.LINK_STALLED, None)
         if session.version is not None:
             self._lost.value += len(session.outbox)
             if not self._leaving:
-                self._context.conditions.set(FaultCode.ROBOT_LOST, session.reason or "ended", quiet=True)
+                self._context.open_faults.set(FaultCode.ROBOT_LOST, session.reason or "ended", quiet=True)
                 self._enforcer.require_neutral("robot lost", StopCause.ROBOT_LOST, stops=False)
             self._pending.refuse_all("the robot was lost")
 
     def _on_established(self, session: Session[Any]) -> None:
         """Stop the robot, which something else may have driven before, and publish what it can show at once."""
         self._greeted = session
-        self._context.conditions.set(FaultCode.ROBOT_LOST, None, quiet=True)
+        self._context.open_faults.set(FaultCode.ROBOT_LOST, None, quiet=True)
         with contextlib.suppress(Refused):  # the condition says so on status
             self._standstill.stop()
         self._enforcer.lease_hook.notify(anew=True)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 
 from zbridge.blackbox import BlackBox
 from zbridge.bus import Bus, Publisher
-from zbridge.control.faults import Conditions, FaultCode
+from zbridge.control.faults import FaultCode, OpenFaults
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import KeySpace, Topic, find
@@ -41,7 +41,7 @@ class RobotPublishers:
         self,
         bus: Bus,
         keys: KeySpace,
-        conditions: Conditions,
+        open_faults: OpenFaults,
         clock: Callable[[], float],
         kept: Callable[[], object] = lambda: None,
         box: BlackBox | None = None,
@@ -51,7 +51,7 @@ class RobotPublishers:
         """The publishers there are, by path."""
         self._bus = bus
         self._keys = keys
-        self._conditions = conditions
+        self._open_faults = open_faults
         self._clock = clock
         self._kept = kept
         self._names = NameBudget()
@@ -140,7 +140,7 @@ class RobotPublishers:
 
     def _show_names(self) -> None:
         text = f"more than {NAMES} different names within an hour: the others are not published"
-        self._conditions.set(FaultCode.TOO_MANY_NAMES, text if self._names.over else None)
+        self._open_faults.set(FaultCode.TOO_MANY_NAMES, text if self._names.over else None)
 
 
 def _is_named(path: str) -> bool:

@@ -16,7 +16,7 @@ from zbridge.bus import Publisher
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
 from zbridge.control.context import Faults, RobotContext
-from zbridge.control.faults import Conditions
+from zbridge.control.faults import OpenFaults
 from zbridge.fleet.topics import KeySpace, Topic
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
@@ -65,7 +65,7 @@ class Webots:
                 KeySpace("fleet", "r1"),
                 self.bus,
                 self.metrics,
-                Conditions(),
+                OpenFaults(),
                 Faults("r1"),
                 clock=asyncio.get_running_loop().time,
             ),

@@ -12,7 +12,7 @@ from tests.proofs import numbered
 from zbridge.client import Fleet
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
-from zbridge.control.context import Faults, RobotContext
+from zbridge.control.context import ProtocolFaults, RobotContext
 from zbridge.control.enforcer import Enforcer
 from zbridge.control.faults import OpenFaults
 from zbridge.control.lease_server import LeaseServer
@@ -92,7 +92,7 @@ class Gateway:
             self._bus,
             metrics,
             OpenFaults(),
-            Faults(name),
+            ProtocolFaults(name),
             publish=self.publish,
             pump=lambda: None,
             clock=self._loop.time,

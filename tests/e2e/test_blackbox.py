@@ -20,7 +20,7 @@ from typing import Any
 import msgpack
 import pytest
 
-import zbridge.blackbox.spool
+import zbridge.blackbox.segment_writer
 from gateways.tcpudp.conformance.fragile_hq import FragileTcpUdpHq
 from tests.e2e.conftest import HOST, WAIT_S, Bench, device, end, repeated, start, until
 from tests.e2e.conftest import Gateway as Process
@@ -497,7 +497,7 @@ async def test_a_disk_that_hangs_delays_neither_drives_nor_the_loop_and_the_end_
 ) -> None:
     disk, withheld, file = BlockedWrites(), Withheld(), bench.folder / "r1.toml"
     bench.stack.callback(disk.free.set)
-    monkeypatch.setattr(zbridge.blackbox.spool, "os", disk)
+    monkeypatch.setattr(zbridge.blackbox.segment_writer, "os", disk)
     bus = f'[bus]\nconnect = ["{bench.endpoint}"]\nmulticast = false\n'
     file.write_text(f'[robot]\nname = "r1"\n{device(robot.port)}{bus}{boxed(bench.folder / "box")}')
     running = asyncio.create_task(Gateway(load(file)).run())

@@ -73,8 +73,8 @@ FOUND = (
     _mutant(
         "a gateway that is gone is shown for ever",
         "zbridge/app/serving.py",
-        "        self._open_faults.set(_RIVALS, text if claims else None)\n",
-        "        if claims:\n            self._open_faults.set(_RIVALS, text)\n",
+        "        self._open_faults.set(FaultCode.SPLIT_CLAIMS, text if claims else None)\n",
+        "        if claims:\n            self._open_faults.set(FaultCode.SPLIT_CLAIMS, text)\n",
     ),
     _mutant(
         "a stop is one of the wheels only",
@@ -128,7 +128,7 @@ FOUND = (
     _mutant(
         "a connection that ended while it was stalled blocks the next one",
         PRESENCE,
-        '        self._commands.blocked = False\n        self._context.open_faults.set("link", None)\n',
+        "        self._commands.blocked = False\n        self._context.open_faults.set(FaultCode.LINK_STALLED, None)\n",
         "",
     ),
     _mutant(
@@ -149,7 +149,7 @@ FOUND = (
         """        self.observed.aside = False
         for connection in self._links:
             connection.mute(False)
-        self._publishers.mute(False)
+        self.publishers.mute(False)
         self._listen()
         self._refuse_all(None)
         self._latch_news.returned()
@@ -160,7 +160,7 @@ FOUND = (
         self.enforcer.stop("served again", StopCause.ANOTHER_GATEWAY)
         for connection in self._links:
             connection.mute(False)
-        self._publishers.mute(False)
+        self.publishers.mute(False)
         self._listen()
         self._refuse_all(None)
         self._latch_news.returned()

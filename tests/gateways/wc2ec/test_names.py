@@ -15,7 +15,7 @@ from tests.gateways.wc2ec.golden import DISTANCE, data, registration
 from zbridge.bus import Publisher
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
-from zbridge.control.context import Faults, RobotContext
+from zbridge.control.context import ProtocolFaults, RobotContext
 from zbridge.control.faults import OpenFaults
 from zbridge.fleet.topics import KeySpace, Topic
 from zbridge.metrics import Metrics
@@ -66,7 +66,7 @@ class Webots:
                 self.bus,
                 self.metrics,
                 OpenFaults(),
-                Faults("r1"),
+                ProtocolFaults("r1"),
                 clock=asyncio.get_running_loop().time,
             ),
             "wc2ec",

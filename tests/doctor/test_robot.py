@@ -11,7 +11,7 @@ from zbridge.client.fleet_model import RobotEntry
 from zbridge.doctor import robot as judge
 from zbridge.doctor.findings import Finding, Layer, Verdict
 from zbridge.errors import Code
-from zbridge.fleet.messages import Control, Latch, LinkStatus, Refusal, Status
+from zbridge.fleet.messages import Control, Fault, Latch, LinkStatus, Refusal, Status
 from zbridge.fleet.processes import DiskSpace, ListenerStats, ProcessStats, Stats
 from zbridge.protocol.plugin import Advice, find_protocol
 
@@ -71,6 +71,18 @@ def test_what_the_protocol_knows_replaces_the_general_finding() -> None:
     status = msgspec.structs.replace(GOOD, state="handshaking")
     finding = only(judge.judge_link(status, {}, (advice,)))
     assert (finding.verdict, finding.code, finding.remedy) == (Verdict.ERROR, "used_up", "restart it")
+
+
+def test_events_of_the_last_minute_are_warnings_and_what_lasts_is_told_elsewhere() -> None:
+    faults = (
+        Fault("deadman", "no command (ann)", 1, 3),
+        Fault("latched", "latched by bob", 1),
+        Fault("robot_lost", "x", 1),
+    )
+    finding = only(judge.judge_faults(Status("established", faults=faults)))
+    assert (finding.code, finding.verdict) == ("fault_deadman", Verdict.WARNING)
+    assert "3 times in the last minutes: no command (ann)" in finding.text
+    assert "zbridge blackbox ls" in (finding.remedy or "")
 
 
 @pytest.mark.parametrize(

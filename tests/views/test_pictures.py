@@ -141,6 +141,14 @@ def test_the_log_has_texts_changes_of_state_and_refusals_that_are_new() -> None:
     assert log(robot, topics.STATUS, m.Status("offline", "no answer")) == [("WARNING", "r1", "offline: no answer")]
     assert log(robot, topics.STATUS, m.Status("offline", "no answer")) == []
     assert log(robot, topics.STATUS, m.Status("established")) == [("INFO", "r1", "established")]
+    deadman = m.Fault("deadman", "no command", 1)
+    told = [("ERROR", "r1", "fault deadman: no command")]
+    assert log(robot, topics.STATUS, m.Status("established", faults=(deadman,))) == told
+    again = m.Fault("deadman", "no command", 1, 7)
+    assert log(robot, topics.STATUS, m.Status("established", faults=(again,))) == []
+    anew = m.Fault("deadman", "no command", 2)
+    assert log(robot, topics.STATUS, m.Status("established", faults=(anew,))) == told
+    assert log(robot, topics.STATUS, m.Status("established")) == []
     assert log(robot, topics.CONTROL, m.Control("held", refusals=(REFUSED,))) == [
         ("WARNING", "r1", "drive of op refused: held by hq (1)")
     ]

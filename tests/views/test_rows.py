@@ -10,7 +10,7 @@ from tests.fake_bus import FakeBus
 from tests.views.top import ESTABLISHED, EVIL, EVIL_SHOWN, entry_of, opened, publish, put, row_of, serve, stats
 from zbridge.client.fleet_model import SILENT_S
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Control, Latch, Refusal, Status
+from zbridge.fleet.messages import Control, Fault, Latch, Refusal, Status
 from zbridge.fleet.printable import as_json
 from zbridge.fleet.processes import ProcessStats, Stats
 from zbridge.views.rows import RobotRow, RowState, as_fields, count_states
@@ -69,6 +69,23 @@ async def test_a_link_that_does_not_work_is_the_state_also_of_a_latched_robot(
     row = row_of(model, "r1")
     assert (row.state.word, row.state.mark, row.driver) == (word, "!", "LATCHED")
     assert set(row.reason.split("; ")) - {""} == {"latched by bob (wet floor)", reason} - {""}
+
+
+async def test_open_faults_are_told_once_unless_another_column_tells_them() -> None:
+    bus = FakeBus()
+    model, _ = opened(bus)
+    serve(bus, "r1", control=LATCHED)
+    faults = (
+        Fault("deadman", "no command for 0.5 s (ann)", 1, 2),
+        Fault("latched", "latched by bob (wet floor)", 1),
+        Fault("audit_log", "the audit log is not written", 1),
+    )
+    put(bus, "r1", topics.STATUS, Status("established", reason="the audit log is not written", faults=faults))
+    row = row_of(model, "r1")
+    told = "latched by bob (wet floor); the audit log is not written; deadman: no command for 0.5 s (ann)"
+    assert row.reason == told
+    shown = as_fields(row, model.robots["r1"])["faults"]
+    assert [(fault["code"], fault["count"]) for fault in shown] == [("deadman", 2), ("latched", 1), ("audit_log", 1)]
 
 
 async def test_while_tokens_may_still_be_on_their_way_and_without_the_bus_no_state_is_known() -> None:

@@ -223,7 +223,7 @@ class EventFaults:
     def latched(self, latches: tuple[Latch, ...], *, anew: bool = True) -> None:
         """Note the latched stops in force."""
         text = ", ".join(latch.described for latch in latches)
-        self._open_faults.set(FaultCode.LATCHED, text or None, anew=anew)
+        self._open_faults.set(FaultCode.LATCHED, text or None, anew=anew, quiet=not anew)
 
     def _note_refusal(self, event: AuthorityEvent) -> None:
         is_motion = event.command is not None and event.command.startswith(("drive", "motor"))

@@ -111,7 +111,6 @@ class RobotDevice(Transferable):
         self._presence = Presence(
             context, protocol, links, enforcer, self._standstill, self._commands, pending, watching
         )
-        open_faults.changed = self._presence.publish_status
         hooks = self._hooks(settings, observer)
         for name, address in zip(context.robot.link_names, settings.addresses, strict=True):
             links.add(Connection(name, f"{keys.robot} {name}", address, settings, hooks))
@@ -169,6 +168,7 @@ class RobotDevice(Transferable):
                     task.cancel()
 
     def _show(self) -> None:
+        self._context.open_faults.changed = self._presence.publish_status
         self._presence.publish_status()
         self.enforcer.report()
 
@@ -358,11 +358,13 @@ class RobotDevice(Transferable):
         self._listen()
         reason = _ASIDE if self.observed.aside else None
         self._refuse_all(reason)
+        self._context.open_faults.changed = self._presence.publish_status
         for connection in self._links:
             await connection.resume()
 
     async def withdraw(self) -> None:
         """Take no commands and queries from the bus any more: another process does."""
+        self._context.open_faults.changed = lambda: None
         handles, self._commanded = self._commanded, []
         for handle in handles:
             handle.close()

@@ -1,4 +1,4 @@
-"""Shows a strict robot and a recording in Foxglove Studio, drives by its Teleop panel, and stops by its button."""
+"""Shows a strict robot, a recording and an incident in Foxglove Studio; drives by Teleop, stops by its button."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import contextlib
 import math
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,7 +22,10 @@ from tests.e2e.rigs.foxglove_viewer import viewing
 from tests.e2e.test_foxglove import Server
 from tests.studio.pages import serve_pages
 from tests.views.foxglove.recordings import record
+from zbridge.blackbox import BoxFolder
 from zbridge.fleet.messages import Scan
+from zbridge.views.recording.contents import Pictures
+from zbridge.views.recording.incident import export_incident
 
 PAGE_PORT = 28080
 PAGE = f"http://localhost:{PAGE_PORT}"
@@ -37,7 +41,7 @@ def main(modules: Path, pictures: Path) -> None:
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory()))
         recording = record(folder / "recording.mcap", 20)
-        stack.enter_context(serve_pages(modules, PAGE_PORT, recording))
+        stack.enter_context(serve_pages(modules, PAGE_PORT, folder))
         playwright = stack.enter_context(sync_playwright())
         browser = playwright.chromium.launch(executable_path="/usr/bin/chromium", args=FLAGS)
         stack.callback(browser.close)
@@ -48,19 +52,24 @@ def main(modules: Path, pictures: Path) -> None:
             return opened
 
         bench = Bench(folder, stack)
-        bench.serve(bench.simulator("tcpudp", "--fragile"))
+        box = folder / "box"
+        bench.serve(bench.simulator("tcpudp", "--fragile"), f'[blackbox]\ndir = "{box}"\n')
         until(lambda: bench.fleet.last("r1/pose"), 30, what="a pose")
         stack.enter_context(scans(bench.endpoint))
         server = Server(bench, "--connect", bench.endpoint, "--drive", "--origin", PAGE)
         with contextlib.closing(page(f"ds=foxglove-websocket&ds.url=ws://localhost:{server.port}")) as opened:
             live(opened, bench, pictures)
+        keep_incident(bench, box, folder / "incident.mcap")
         player = Server(bench, str(recording), "--origin", PAGE)
         with contextlib.closing(page(f"ds=foxglove-websocket&ds.url=ws://localhost:{player.port}")) as opened:
             played(opened, player.port, pictures)
-        with contextlib.closing(page(f"ds=remote-file&ds.url={PAGE}/recording.mcap")) as opened:
-            opened.wait_for_timeout(2 * LOAD_S * 1000)
-            tidy(opened)
-            opened.screenshot(path=pictures / "file.png", timeout=_WAIT_MS)
+        for name in ("recording", "incident"):
+            with contextlib.closing(page(f"ds=remote-file&ds.url={PAGE}/{name}.mcap")) as opened:
+                opened.wait_for_timeout(2 * LOAD_S * 1000)
+                tidy(opened)
+                opened.keyboard.press("Space")  # play
+                opened.wait_for_timeout(LOAD_S * 1000)
+                opened.screenshot(path=pictures / f"{name}-file.png", timeout=_WAIT_MS)
 
 
 def live(page: Page, bench: Bench, pictures: Path) -> None:
@@ -86,6 +95,16 @@ def live(page: Page, bench: Bench, pictures: Path) -> None:
     stop.click()
     until(lambda: bench.fleet.last("r1/control").get("state") == "stopped", 20, what="a stopped robot")
     print("stopped by the STOP button")
+
+
+def keep_incident(bench: Bench, box: Path, output: Path) -> None:
+    """Let the black box keep the minutes before, and export them."""
+    assert bench.fleet.get("fleet/r1/@rpc/blackbox/keep/ann", text="looks odd", kind="chat") == [{}]
+    folder = BoxFolder(box, "fleet", "r1")
+    (info,) = until(folder.infos, 20, what="the incident")
+    time.sleep(3.0)
+    found = export_incident(folder.parts(info.name), info, output, Pictures())
+    print(f"{found.records} messages of {info.name}")
 
 
 def tidy(page: Page) -> None:

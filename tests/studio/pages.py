@@ -16,14 +16,13 @@ _KINDS = {".html": "text/html", ".js": "text/javascript", ".json": "application/
 
 
 @contextlib.contextmanager
-def serve_pages(modules: Path, port: int, recording: Path | None) -> Iterator[None]:
-    """Serve ``/`` and what it needs; ``/recording.mcap`` by ranges."""
+def serve_pages(modules: Path, port: int, recordings: Path | None) -> Iterator[None]:
+    """Serve ``/`` and what it needs, and the recordings of a folder (``/recording.mcap``) by ranges."""
     fixed = {
         "/": HERE / "page.html",
         "/react.js": modules / "react" / "umd" / "react.production.min.js",
         "/react-dom.js": modules / "react-dom" / "umd" / "react-dom.production.min.js",
         "/layout.json": LAYOUT,
-        **({"/recording.mcap": recording} if recording is not None else {}),
     }
     assets = modules / "@foxglove" / "studio-base" / "assets"
 
@@ -37,6 +36,8 @@ def serve_pages(modules: Path, port: int, recording: Path | None) -> Iterator[No
         def _answer(self, *, body: bool) -> None:
             path = self.path.partition("?")[0]
             file = fixed.get(path) or assets / Path(path).name
+            if recordings is not None and path.endswith(".mcap"):
+                file = recordings / Path(path).name
             if not file.is_file():
                 self.send_error(404)
                 return

@@ -1,0 +1,1 @@
+"""MAVLink, message set ``common`` of ArduPilot: so far the codec, which no gateway uses yet."""

@@ -15,7 +15,7 @@ from binascii import crc_hqx
 import msgspec
 
 from gateways.mavlink.messages import MESSAGES, MavlinkMessage
-from zbridge.errors import EncodeError, ProtocolError
+from zbridge.protocol import EncodeError, ProtocolError
 
 MARKER, MARKER_1 = 0xFD, 0xFE
 """The first byte of a frame of version 2, and of version 1."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Annotated, ClassVar, TypeVar
 
-from zbridge.errors import EncodeError
+from zbridge.protocol import EncodeError
 from zbridge.wire import BinaryCodec, Message, Scalar
 from zbridge.wire.fields import declared_fields
 

@@ -83,7 +83,7 @@ async def test_stop_all_is_in_sight_on_every_page_and_a_click_leaves_it_without_
     for path in ("", "#/robot/free", "#/robot/nobody"):
         await page.goto(f"{browser.at}/{path}")
         button = page.get_by_role("button", name="STOP ALL", exact=True)
-        assert await button.is_visible()
+        await button.wait_for()
         box = await button.bounding_box()
         assert box["y"] + box["height"] < NARROW["height"] / 2
         before = len(feed.requests())

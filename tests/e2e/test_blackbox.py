@@ -101,6 +101,7 @@ def test_a_killed_gateway_leaves_all_but_the_last_seconds_and_the_next_one_keeps
     bench.serve(robot.port, boxed(folder))
     until(lambda: fault(bench, "gateway_died"), what="the fault")
     (info,) = until(lambda: box.incidents, what="the incident")
+    until(lambda: len(box.kept(info).records) >= len(before.records), what="the segments of the ring")
     kept = box.kept(info)
     assert box.codes == [["gateway_died"]]
     assert f"process {pid} did not shut down cleanly" in info.causes[0].text

@@ -116,12 +116,15 @@ def _rates(truths: Sequence[tuple[float, Truth]]) -> tuple[float, float]:
 
 
 def _usual(values: list[float]) -> float:
-    """Return the median of the values that are no less than half the greatest.
+    """Return the median of the values that are no less than half of the upper quartile.
 
-    On a busy machine a drive may come late, and the robot stops meanwhile; a simulator that was late catches up.
+    On a busy machine a drive may come late, and the robot stops meanwhile; a simulator that was late catches up, and
+    seems far too fast for a moment.
     """
-    most = max(map(abs, values), default=0.0)
-    return median(value for value in values if abs(value) >= most / 2) if values else 0.0
+    if not values:
+        return 0.0
+    fast = sorted(map(abs, values))[3 * len(values) // 4]
+    return median(value for value in values if abs(value) >= fast / 2)
 
 
 def full_scale(protocol: plugin.Protocol, *names: str) -> float:

@@ -178,7 +178,7 @@ def test_a_supervisor_says_of_a_gateway_whether_it_hung_or_was_killed_and_the_wh
         info, text = host.incident("frozen", "gateway_hung")
         assert f"process {pids['frozen']} sent no heartbeat" in text
         assert info.frame["control"]["holder"] == "op1"
-        assert host.boxes["frozen"].kept(info).of("@cmd/drive")
+        until(lambda: host.boxes["frozen"].kept(info).of("@cmd/drive"), what="its drives")
         info, text = host.incident("killed", "gateway_died")
         assert text == f"process {pids['killed']} was killed by SIGKILL"
         assert info.frame["control"]["holder"] == "op1"
@@ -195,6 +195,7 @@ def test_a_supervisor_says_of_a_gateway_whether_it_hung_or_was_killed_and_the_wh
     host.run()
     info, text = host.incident("untouched", "gateway_died")
     assert f"process {pids['untouched']} did not shut down cleanly" in text
+    until(lambda: len(host.boxes["untouched"].kept(info).records) >= len(before.records), what="its segments")
     records = host.boxes["untouched"].kept(info).records
     assert records[: len(before.records)] == before.records
     assert info.frame["control"]["holder"] == "op1"

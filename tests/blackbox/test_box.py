@@ -283,7 +283,7 @@ async def test_states_that_wait_for_a_disk_that_hangs_are_bounded(scene: Scene) 
     taken = []
     scene.box.snapshot = lambda: taken.append(scene.now()) or [("fleet/r1/status", b"\x80")]
     await asyncio.sleep(3600)
-    assert len(taken) == STATES - 1, "and the one of the begin"
+    assert len(taken) == STATES - 1, "and one at the begin"
     await scene.after(70)
     assert scene.keys().count("status") >= 7, "and afterwards all is as before"
 

@@ -39,9 +39,9 @@ def refused(code: Code = Code.NOT_READY, who: str | None = "ann", command: str =
 
 
 def test_a_lasting_fault_opens_at_once_and_heals_when_its_cause_is_gone_for_long_enough(scene: Scene) -> None:
-    scene.open_faults.set(FaultCode.LINK_STALLED, "takes nothing")
+    scene.open_faults.set(FaultCode.LINK_STALLED, "is stalled")
     scene.after(3600.0)
-    assert (scene.open, scene.open_faults.texts) == ({"link_stalled": 1}, ("takes nothing",))
+    assert (scene.open, scene.open_faults.texts) == ({"link_stalled": 1}, ("is stalled",))
     scene.open_faults.set(FaultCode.LINK_STALLED, None)
     scene.after(SETTLE_S - 0.1)
     assert (scene.open, scene.open_faults.texts) == ({"link_stalled": 1}, ())
@@ -51,15 +51,15 @@ def test_a_lasting_fault_opens_at_once_and_heals_when_its_cause_is_gone_for_long
 
 def test_a_fault_that_flaps_opens_once_and_counts_its_occurrences(scene: Scene) -> None:
     for _ in range(20):
-        scene.open_faults.set(FaultCode.LINK_STALLED, "takes nothing")
+        scene.open_faults.set(FaultCode.LINK_STALLED, "is stalled")
         scene.after(1.0)
         scene.open_faults.set(FaultCode.LINK_STALLED, None)
         scene.after(1.0)
     assert scene.open == {"link_stalled": 20}
     assert scene.open_faults.counts == {FaultCode.LINK_STALLED: 1}
-    assert scene.occurred == [("link_stalled", "takes nothing")] * 20
+    assert scene.occurred == [("link_stalled", "is stalled")] * 20
     scene.after(SETTLE_S)
-    scene.open_faults.set(FaultCode.LINK_STALLED, "takes nothing")
+    scene.open_faults.set(FaultCode.LINK_STALLED, "is stalled")
     assert scene.open_faults.counts == {FaultCode.LINK_STALLED: 2}
 
 

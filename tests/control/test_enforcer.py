@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
 
 import pytest
@@ -20,14 +21,16 @@ from zbridge.control.faults import OpenFaults
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import Standstill
 from zbridge.errors import NeutralFirst, RateLimited
+from zbridge.fleet import payload as payloads
 from zbridge.fleet.lease_messages import Acquire
-from zbridge.fleet.messages import Drive, FleetMessage, Mode, Motor, Raw, Text
+from zbridge.fleet.messages import Drive, FleetMessage, Mode, Motor, Raw, Stop, Text
 from zbridge.fleet.topics import KeySpace
 from zbridge.metrics import Metrics
 
 PATH = "@cmd/drive"
 DEADMAN_S = 0.5
 FORWARD = Drive(forward=1.0)
+LATCHING = payloads.encode(Stop(latch=True, id=bytes(16), who="bob", reason="wet floor"))
 
 
 class Rig:
@@ -37,12 +40,13 @@ class Rig:
         self.shown: list[FleetMessage] = []
         self.metrics = Metrics()
         self.authority = Authority(3.0, DEADMAN_S, numbered())
+        self.open_faults = open_faults = OpenFaults()
         context = RobotContext(
             self.machine,
             KeySpace("fleet", "r1"),
             FakeBus(),
             self.metrics,
-            OpenFaults(),
+            open_faults,
             ProtocolFaults("r1"),
             publish=lambda topic, message: self.shown.append(message),
             pump=lambda: None,
@@ -75,6 +79,25 @@ async def test_a_gateway_frozen_past_the_deadman_stops_the_robot_before_it_write
     assert rig.machine.stops == 1
     with pytest.raises(NeutralFirst):
         rig.enforcer.permit(FORWARD, rig.now)
+
+
+@pytest.mark.parametrize("cause", ["deadman", "latch"])
+async def test_a_robot_is_stopped_before_anything_hears_of_the_fault(cause: str) -> None:
+    rig, heard = Rig(), []
+    rig.drive()
+
+    def occurred(code: str, text: str) -> None:
+        heard.append((code, rig.machine.stops))
+        raise OSError("the black box fails")
+
+    rig.open_faults.occurred = occurred
+    with contextlib.suppress(OSError):
+        if cause == "deadman":
+            rig.now += DEADMAN_S + 0.1
+            rig.enforcer.keep_time()
+        else:
+            rig.enforcer.stop_commanded(Sample("fleet/r1/@cmd/stop", LATCHING))
+    assert heard == [("deadman" if cause == "deadman" else "latched", 1)]
 
 
 async def test_a_machine_that_was_suspended_stops_its_robot_and_ends_the_lease_before_anything_is_read() -> None:

@@ -8,10 +8,10 @@ with, or when it is large or old. Without an incident the next segment is made i
 are made there until :data:`AFTER_S` after the last cause, but no longer than :attr:`Spool.longest_s`. Later causes join
 it. What follows has an incident of its own, which names the one with the minutes before.
 
-An OSError ends the segment; what was not written is counted, the next call tries again, and causes that could not be
-noted are kept for it. A full disk costs the oldest segment of the ring at each attempt. What the process before left
-open is continued. In a restart two processes write for a moment: segments have different names, causes are added to
-what the file says, and the incident that the first one began last is continued when it has left.
+An OSError while records are written ends the segment, and they are counted. The next call tries again; causes that
+could not be noted are kept for it. A full disk costs the oldest segment of the ring at each attempt. What the process
+before left open is continued. In a restart two processes write for a moment: segments have different names, causes are
+added to what the file says, and the incident that the first one began last is continued when it has left.
 """
 
 from __future__ import annotations

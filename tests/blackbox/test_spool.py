@@ -258,6 +258,13 @@ def test_only_the_newest_incidents_are_kept(scene: Scene, process: Process) -> N
     assert process.spool.removed == 3
 
 
+def test_a_cause_that_comes_again_and_again_makes_way_for_a_rare_one(scene: Scene, process: Process) -> None:
+    for code in ("deadman", *["link_stalled"] * 6, "mark"):
+        process.keep(code)
+        process.run(200)
+    assert [info.causes[0].code for info in scene.folder.infos()] == ["deadman", "link_stalled", "mark"]
+
+
 def test_one_that_cannot_be_deleted_keeps_no_others(
     scene: Scene, process: Process, monkeypatch: pytest.MonkeyPatch
 ) -> None:

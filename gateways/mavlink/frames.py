@@ -25,6 +25,7 @@ MOST_BYTES = 10 + 255 + 2 + 13
 LIMIT_BYTES = 2 * MOST_BYTES
 """Most bytes that wait: a doubtful frame, and one that begins within it."""
 HEADER, HEADER_1 = 10, 6
+_SEQ_AT = 4
 _SIGNATURE = 13
 _QUOTED = 24
 _REVERSED = bytes(int(f"{value:08b}"[::-1], 2) for value in range(256))
@@ -96,6 +97,13 @@ def frame_of(message_id: int, payload: bytes, crc_extra: bytes, seq: int, system
         raise EncodeError(f"system {system}, component {component}: expected 0 to 255") from error
     crc = checksum(head[1:] + payload, crc_extra)
     return head + payload + crc.to_bytes(2, "little")
+
+
+def numbered(frame: bytes, seq: int) -> bytes:
+    """Return a frame that :func:`write_frame` wrote with another sequence number."""
+    spec = MESSAGES[frame[7] | frame[8] << 8 | frame[9] << 16]
+    changed = b"".join((frame[1:_SEQ_AT], bytes((seq & 0xFF,)), frame[_SEQ_AT + 1 : -2]))
+    return b"".join((frame[:1], changed, checksum(changed, spec.crc_extra).to_bytes(2, "little")))
 
 
 def _header(data: bytes, start: int, size: int) -> tuple[int, int, int] | None:

@@ -50,7 +50,8 @@ class Broadcast:
         if isinstance(message, Control):
             for client in tuple(self._clients.values()):
                 client.operator.look(message)
-            return
+            if topic.path not in self._context.side.follows:
+                return
         if isinstance(message, Status):
             self._tell_presence()
         if self._clients:

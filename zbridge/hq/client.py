@@ -104,6 +104,15 @@ class Client:
             self._told = {old: at for old, at in self._told.items() if now - at < TELL_S} | {text: now}
             self.send(lambda session, now: self._context.side.tell(session, text, now))
 
+    def _stop_driving(self, why: str) -> None:
+        """Tell the people at the client why it does not drive, and show its program that it does not."""
+        self.tell(why)
+        self._show_not_driving()
+
+    def _show_not_driving(self) -> None:
+        if self.begun:
+            self.send(self._context.side.not_driving)
+
     def tick(self) -> None:
         """Let the side and the operator repeat and renew; called every ``ATTEND_S`` while the operator is active."""
         if self.operator.intent.held:
@@ -121,6 +130,8 @@ class Client:
 
     def let_go(self, why: str) -> None:
         """Give the robot back; the program must send neutral before it drives again."""
+        if self.operator.intent.held:
+            self._show_not_driving()
         self.operator.let_go(why)
 
     # A restart
@@ -238,7 +249,10 @@ class Client:
         context = self._context
         self.session.traffic.refused += 1
         context.counts.refused.value += 1
-        self.tell(str(refusal))
+        if topic is topics.CMD_DRIVE:
+            self._stop_driving(str(refusal))
+        else:
+            self.tell(str(refusal))
         if context.robot.view.alive:
             self._refusals.note(self.operator.who, topic.path.partition("/")[2], refusal)
 
@@ -279,7 +293,7 @@ class Client:
             who=f"hq.{self._context.name}.{self.number}",
             protocol=side.name,
             is_motion=side.is_motion,
-            tell=self.tell,
+            tell=self._stop_driving,
             clock=self._context.clock,
             clock_ms=self._context.clock_ms,
         )

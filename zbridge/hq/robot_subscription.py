@@ -47,7 +47,7 @@ class RobotSubscription:
         """
         self._gateway.append(on_gateway)
         on_gateway(self.view.alive)
-        for path in (*_STATES, *paths):
+        for path in dict.fromkeys((*_STATES, *paths)):
             self.also_follow(path, follower)
 
     def unfollow(self, path: str, follower: Follow) -> None:

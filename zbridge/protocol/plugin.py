@@ -191,7 +191,7 @@ class HqSide(Kept, ABC):
     datagrams: bool = False
     """Whether clients send datagrams too."""
     follows: tuple[str, ...]
-    """Paths (``pose``, ``sensor/*``) whose messages :meth:`show` gets."""
+    """Paths (``pose``, ``sensor/*``, ``control``) whose messages :meth:`show` gets; it gets ``status`` too."""
 
     @abstractmethod
     def session(self, number: int, bounds: Limits) -> Session[Any]:
@@ -215,6 +215,10 @@ class HqSide(Kept, ABC):
 
     def tell(self, session: Any, text: str, now: float) -> None:
         """Show a text to the people at a client, if the protocol can."""
+        return
+
+    def not_driving(self, session: Any, now: float) -> None:
+        """Show a client that it does not drive, as :meth:`tell` explains: refused motion, or a lease that has ended."""
         return
 
     def presence(self, there: bool) -> Send | None:

@@ -1,0 +1,147 @@
+"""One ground station at a listener: its session, with the mode and the arming that are its own. Sans-IO.
+
+Source: "The gateway as vehicle" of the protocol page.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar
+
+import msgspec
+
+from gateways.mavlink.frames import MavlinkFrame, read_frame
+from gateways.mavlink.messages import MavlinkMessage
+from gateways.mavlink.messages.telemetry import MavlinkHeartbeat, Statustext
+from gateways.mavlink.numbers import ARDUPILOT, ARMED, AUTOPILOT, BOAT, CUSTOM_MODE, ROVER, RoverMode, Severity
+from gateways.mavlink.session import MavlinkSession
+from gateways.mavlink.station.options import MavlinkHqOptions
+from gateways.mavlink.station.parameters import Parameters
+from gateways.mavlink.station.streams import TIMED, Streams
+from gateways.mavlink.station.vehicle import Vehicle
+from zbridge.fleet.messages import Drive
+from zbridge.protocol import Limits, Refused, Role
+
+HEARTBEAT_S = 1.0
+TEXT_BYTES = 50
+"""Bytes of a text that fits into one message."""
+WARN_S = 2.0
+"""Seconds within which a warning that the client's stream causes is not repeated."""
+_STICKS = 64
+"""The bit of ``base_mode`` that an ArduRover always has: it can be driven by hand."""
+_STANDBY, _ACTIVE = 3, 4
+_MAVLINK = 3
+
+
+class Stick(msgspec.Struct):
+    """What sticks and setpoints have said. axes: throttle and steering to the right, thousandths."""
+
+    axes: tuple[int, int] = (0, 0)
+    heard_at: float = -math.inf
+    channels_us: list[int] = msgspec.field(default_factory=lambda: [1500, 1500])
+    """Throttle and steering of the RC override."""
+    entered: bool = False
+    """Whether GUIDED was entered, and no motion has counted since."""
+    target_at: float = -math.inf
+    live_from: float = math.inf
+    """When setpoints count, unless there is a gap before."""
+    last: Drive = Drive()
+    changed_at: float = -math.inf
+
+
+class Station(MavlinkSession[MavlinkFrame]):
+    """A ground station. vehicle, parameters: what it is told of the robot."""
+
+    role = Role.ROBOT
+    kept: ClassVar[dict[str, Any]] = {"mode": int, "armed": bool, "there": bool, "streams": Streams}
+
+    def __init__(self, options: MavlinkHqOptions, vehicle: Vehicle, parameters: Parameters, bounds: Limits) -> None:
+        super().__init__(options.system_id, AUTOPILOT, bounds)
+        self.vehicle, self.parameters = vehicle, parameters
+        self.options = options
+        self.stick = Stick()
+        self.mode: int = RoverMode.HOLD
+        self.armed = False
+        self.there = False
+        """Whether the robot is there; else the client hears nothing, and takes the vehicle for lost."""
+        self.streams = Streams()
+        self.now = -math.inf
+        """When it was read last."""
+        self._kind = BOAT if options.kind == "boat" else ROVER
+        self._beats_at = math.inf
+        self._warned: dict[str, float] = {}
+
+    @property
+    def who(self) -> str:
+        """The client's name as the holder of a robot."""
+        return f"hq.{self.name}"
+
+    # What the core calls
+
+    def opened(self, now: float) -> None:
+        self.establish("", ())
+
+    def receive(self, data: bytes, now: float) -> list[MavlinkFrame]:
+        self.now = now
+        return super().receive(data, now)
+
+    def decode(self, frame: bytes) -> MavlinkFrame:
+        return read_frame(frame)
+
+    def accept(self, message: MavlinkFrame, now: float) -> bool:
+        return True
+
+    def timers(self) -> float:
+        return min(self._beats_at, self.streams.due) if self.there else math.inf
+
+    def on_timer(self, now: float) -> None:
+        if now >= self._beats_at:
+            self.beat(now)
+        for message_id in TIMED:
+            if self.streams.take(message_id, now) and (message := self.vehicle.message(message_id)) is not None:
+                self.outbox.set(str(message_id), (self.encode(message),), now)
+
+    # What it is shown
+
+    def beat(self, now: float) -> None:
+        """Show mode and arming at once, and then every second."""
+        if not self.there:
+            return
+        base = CUSTOM_MODE | _STICKS | (ARMED if self.armed else 0)
+        state = _ACTIVE if self.armed else _STANDBY
+        heartbeat = MavlinkHeartbeat(self.mode, self._kind, ARDUPILOT, base, state, _MAVLINK)
+        self.outbox.set("heartbeat", (self.encode(heartbeat),), now)
+        self._beats_at = now + HEARTBEAT_S
+
+    def appear(self, now: float, *, there: bool) -> None:
+        """Show that the robot is there, or nothing any more."""
+        self.there = there
+        if there:
+            self.beat(now)
+        else:
+            self.rest(now)
+
+    def rest(self, now: float) -> None:
+        """Show HOLD, disarmed: the client does not drive."""
+        if self.armed or self.mode != RoverMode.HOLD:
+            self.armed, self.mode = False, RoverMode.HOLD
+            self.beat(now)
+
+    def answer(self, message: MavlinkMessage) -> None:
+        """Send a message once; what finds no place is dropped and counted."""
+        try:
+            self.outbox.put(self.encode(message))
+        except Refused:
+            self.traffic.dropped += 1
+
+    def text(self, text: str, severity: Severity = Severity.WARNING) -> None:
+        """Show a text to the people at the station, cut to 50 bytes."""
+        if self.there:
+            cut = text.encode()[:TEXT_BYTES].decode(errors="ignore").encode()
+            self.answer(Statustext(severity, cut))
+
+    def warn(self, text: str) -> None:
+        """Show a warning that the client's own stream causes, not for each of its messages."""
+        if self.now - self._warned.get(text, -math.inf) >= WARN_S:
+            self._warned = {old: at for old, at in self._warned.items() if self.now - at < WARN_S} | {text: self.now}
+            self.text(text)

@@ -19,18 +19,18 @@ from gateways.mavlink.station.options import MavlinkHqOptions
 from gateways.mavlink.station.parameters import Parameters
 from gateways.mavlink.station.streams import TIMED, Streams
 from gateways.mavlink.station.vehicle import Vehicle
+from gateways.mavlink.texts import chunks_of, clip
 from zbridge.fleet.messages import Drive
 from zbridge.protocol import Limits, Refused, Role
 
 HEARTBEAT_S = 1.0
-TEXT_BYTES = 50
-"""Bytes of a text that fits into one message."""
 WARN_S = 2.0
 """Seconds within which a warning that the client's stream causes is not repeated."""
 _STICKS = 64
 """The bit of ``base_mode`` that an ArduRover always has: it can be driven by hand."""
 _STANDBY, _ACTIVE = 3, 4
 _MAVLINK = 3
+_MOST_TEXT_ID = 65535
 
 
 class Stick(msgspec.Struct):
@@ -53,7 +53,7 @@ class Station(MavlinkSession[MavlinkFrame]):
     """A ground station. vehicle, parameters: what it is told of the robot."""
 
     role = Role.ROBOT
-    kept: ClassVar[dict[str, Any]] = {"mode": int, "armed": bool, "there": bool, "streams": Streams}
+    kept: ClassVar[dict[str, Any]] = {"mode": int, "armed": bool, "there": bool, "streams": Streams, "_texts": int}
 
     def __init__(self, options: MavlinkHqOptions, vehicle: Vehicle, parameters: Parameters, bounds: Limits) -> None:
         super().__init__(options.system_id, AUTOPILOT, bounds)
@@ -69,6 +69,7 @@ class Station(MavlinkSession[MavlinkFrame]):
         """When it was read last."""
         self._kind = BOAT if options.kind == "boat" else ROVER
         self._beats_at = math.inf
+        self._texts = 0
         self._warned: dict[str, float] = {}
 
     @property
@@ -135,10 +136,15 @@ class Station(MavlinkSession[MavlinkFrame]):
             self.traffic.dropped += 1
 
     def text(self, text: str, severity: Severity = Severity.WARNING) -> None:
-        """Show a text to the people at the station, cut to 50 bytes."""
-        if self.there:
-            cut = text.encode()[:TEXT_BYTES].decode(errors="ignore").encode()
-            self.answer(Statustext(severity, cut))
+        """Show a text to the people at the station; a warning in one message, cut to 50 bytes."""
+        if not self.there:
+            return
+        if severity is Severity.WARNING:
+            self.answer(Statustext(severity, clip(text)))
+            return
+        self._texts = self._texts % _MOST_TEXT_ID + 1
+        for chunk in chunks_of(text, severity, self._texts):
+            self.answer(chunk)
 
     def warn(self, text: str) -> None:
         """Show a warning that the client's own stream causes, not for each of its messages."""

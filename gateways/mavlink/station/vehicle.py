@@ -127,7 +127,10 @@ class Vehicle:
 
     def _status(self) -> MavlinkMessage:
         sensors = HEALTHY | (_GPS if self.options.origin is not None else 0)
-        return telemetry.SysStatus(sensors, sensors, sensors, 0, *self._power())
+        voltage, current, left = self._power()
+        return telemetry.SysStatus(
+            sensors, sensors, sensors, voltage_battery=voltage, current_battery=current, battery_remaining=left
+        )
 
     def _battery_status(self) -> MavlinkMessage | None:
         if self._battery is None:

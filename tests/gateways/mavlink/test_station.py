@@ -111,7 +111,8 @@ class Scene:
 
     def publishes(self, path: str, message: FleetMessage) -> None:
         topic = topics.find(path)
-        assert topic is not None and (path in self.side.follows or path == "status")
+        assert topic is not None
+        assert (path in self.side.follows or path == "status")
         self.view.note(topic, message)
         self.send(self.side.show(topic, message))
 
@@ -278,7 +279,8 @@ def test_all_parameters_come_and_none_is_changed() -> None:
         values += ground.heard("PARAM_VALUE")
         scene.now += 0.011
     assert [value.param_index for value in values] == list(range(values[0].param_count))
-    assert {value.param_count for value in values} == {len(values)} and len(values) >= 12
+    assert {value.param_count for value in values} == {len(values)}
+    assert len(values) >= 12
     named = {value.param_id: value.param_value for value in values}
     assert (named["SYSID_THISMAV"], named["WP_SPEED"]) == (7.0, pytest.approx(0.7))
     ground.says(mavlink.MAVLink_param_set_message(SYSTEM, 1, b"WP_SPEED", 9.0, 9))
@@ -337,7 +339,8 @@ def test_setpoints_drive_once_they_have_come_for_a_while() -> None:
     assert drives(ground.aims(1.0, 0.25)) == [Drive(forward=0.5, turn=-0.5)]
     assert drives(ground.aims(-4.0)) == [Drive(forward=-1.0)]
     assert drives(ground.aims(1.0, 0.25, frame=9, mask=VELOCITY | 2048)) == [Drive(forward=0.5)]
-    assert not ground.aims(1.0, frame=1) and not ground.aims(1.0, mask=0xDF8)
+    assert not ground.aims(1.0, frame=1)
+    assert not ground.aims(1.0, mask=0xDF8)
     assert ground.texts == ["only velocity setpoints, frame 8 or 9"]
     assert ground.shown == (GUIDED, True)
 
@@ -395,7 +398,8 @@ def test_anybody_may_stop(command: tuple[float, ...]) -> None:
     scene.publishes("control", Control("held", holder="ann"))
     (ground,) = scene.stations
     ((topic, stop),) = ground.commands(int(command[0]), *command[1:])
-    assert topic is topics.CMD_STOP and isinstance(stop, Stop)
+    assert topic is topics.CMD_STOP
+    assert isinstance(stop, Stop)
     assert ground.acknowledged == [(command[0], ACCEPTED)]
 
 

@@ -6,14 +6,15 @@ import math
 
 import pytest
 
-from tests.hq.scene import COMMANDS, KEYS, Scene, ToySession, ToySide, play, serving
+from tests.hq.scene import COMMANDS, KEYS, Scene, ToySession, ToySide, framed, play, serving
 from tests.hq.scripts import scripts
 from zbridge.bus.interface import IncomingQuery
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Drive, Query, Refusal, Refusals, Switch, Text
+from zbridge.fleet.messages import Control, Drive, FleetMessage, Query, Refusal, Refusals, Switch, Text
+from zbridge.fleet.topics import Topic
 from zbridge.protocol.outbox import LIMIT
-from zbridge.protocol.plugin import ATTEND_S, RobotUser, Telemetry
+from zbridge.protocol.plugin import ATTEND_S, RobotUser, Send, Telemetry
 from zbridge.protocol.session import Limits
 
 pytestmark = pytest.mark.jumping
@@ -27,6 +28,21 @@ class HoldingSide(ToySide):
             client.let_go("the connection is silent")
         else:
             client.repeat()
+
+
+class ShowingSide(ToySide):
+    """A protocol whose programs show whether they drive, and who does."""
+
+    follows = (*ToySide.follows, "control")
+
+    def not_driving(self, session: ToySession, now: float) -> None:
+        session.send(b"off")
+
+    def show(self, topic: Topic, message: FleetMessage) -> Send | None:
+        if isinstance(message, Control):
+            holder = str(message.holder).encode()
+            return lambda session, now: session.outbox.set("holder", (framed(holder),), now)
+        return super().show(topic, message)
 
 
 class HalfSide(ToySide):
@@ -114,6 +130,12 @@ a driver that is lost in any way gives the robot back: it stalls [rate_hz=100]
     a drives; holder hq.toy.2; a stalls; 70 x (a says go; wait 0.1); clients nothing; state free; tokens gateway
 a driver that is closed gives the robot back before its last words are out [idle_s=1]
     a drives; a stalls; text last words; wait 1.5; sessions closing; state free; tokens gateway
+a program that shows whether it drives is shown each time that it does not [side=ShowingSide]
+    a greets; a says go; a hears ! connected: centre the joystick first, off; a says go; a hears off; a says stand, go
+    shown; a hears hq.toy.2; operator-takes-over; shown
+    a hears operator, ! not driving: the lease has ended (taken over by operator), off
+what a driver's lease was taken for is shown, and only to the driver [side=ShowingSide]
+    a drives; b greets; shown; a hears hq.toy.2; b hears hq.toy.2; frozen 5; wait 0.15; a hears off; b hears nothing
 a refused client is told why, and not all the time
     a greets; 10 x (a says go; wait 0.02); a hears ! connected: centre the joystick first; refused 10; wait 5.0
     a says go; a hears ! connected: centre the joystick first

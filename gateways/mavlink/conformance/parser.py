@@ -45,7 +45,8 @@ REQUEST_DATA_STREAM 66 148 req_message_rate:H target_system:B target_component:B
 MANUAL_CONTROL 69 243 x:h y:h z:h r:h buttons:H target:B + buttons2:H enabled_extensions:B s:h t:h aux1-6:h
 RC_CHANNELS_OVERRIDE 70 124 chan1-8_raw:H target_system:B target_component:B + chan9-18_raw:H
 VFR_HUD 74 20 airspeed:f groundspeed:f alt:f climb:f heading:h throttle:H
-COMMAND_INT 75 158 param1-4:f x:i y:i z:f command:H target_system:B target_component:B frame:B current:B autocontinue:B
+COMMAND_INT 75 158 param1-4:f x:i y:i z:f command:H target_system:B target_component:B frame:B current:B
+    autocontinue:B
 COMMAND_LONG 76 152 param1-7:f command:H target_system:B target_component:B confirmation:B
 COMMAND_ACK 77 143 command:H result:B + progress:B result_param2:i target_system:B target_component:B
 SET_ATTITUDE_TARGET 82 49 time_boot_ms:I q:4f body_roll_rate:f body_pitch_rate:f body_yaw_rate:f thrust:f
@@ -61,8 +62,8 @@ BATTERY_STATUS 147 154 current_consumed:i energy_consumed:i temperature:h voltag
     battery_function:B type:B battery_remaining:b + time_remaining:i charge_state:B voltages_ext:4H mode:B
     fault_bitmask:I
 AUTOPILOT_VERSION 148 178 capabilities:Q uid:Q flight_sw_version:I middleware_sw_version:I os_sw_version:I
-    board_version:I vendor_id:H product_id:H flight_custom_version:8B middleware_custom_version:8B os_custom_version:8B
-    + uid2:18B
+    board_version:I vendor_id:H product_id:H flight_custom_version:8B middleware_custom_version:8B
+    os_custom_version:8B + uid2:18B
 HOME_POSITION 242 104 latitude:i longitude:i altitude:i x:f y:f z:f q:4f approach_x:f approach_y:f approach_z:f
     + time_usec:Q
 MESSAGE_INTERVAL 244 95 interval_us:i message_id:H

@@ -82,7 +82,10 @@ class FragileRover(FragileServer):
         """Reset the connection; the next one is served."""
         if self._conn is not None:
             reset_on_close(self._conn)
-            self._conn.close()
+            if self._midway:  # the write that waits must end first
+                self._shut()
+            else:
+                self._conn.close()
             self._leave("the vehicle cut the connection")
 
     # The connection

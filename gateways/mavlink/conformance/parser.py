@@ -72,7 +72,7 @@ STATUSTEXT 253 83 severity:B text:50s + id:H chunk_seq:B
 OBSTACLE_DISTANCE 330 23 time_usec:Q distances:72H min_distance:H max_distance:H sensor_type:B increment:B
     + increment_f:f angle_offset:f frame:B
 """
-"""Name, id, CRC_EXTRA, and the fields as they lie on the wire; ``a1-3`` is three fields, ``+`` begins the extensions."""
+"""Name, id, CRC_EXTRA, and the fields as they lie on the wire; ``a1-3`` is three fields, ``+`` begins extensions."""
 
 
 class _Layout:

@@ -153,8 +153,8 @@ class FragileStation(HqProgram):
             await ticker.tick()
             now = time.monotonic()
             self.rules.step(now, min(ticker.passed_s, _CYCLE_S * 2), ticker.late_s)
-            self._take(*drain(self._tcp))
             self.station.step(now)
+            self._take(*drain(self._tcp))
             data = b"".join(self._write_one() for _ in range(len(self.station.out)))
             if data:
                 await self._write(data)

@@ -661,7 +661,7 @@ async def test_a_fragile_station_drives_a_vehicle_by_tcp() -> None:
     assert (station.armed, station.mode) == (True, 15)
     assert await station.hold() == 0
     assert station.results == [(176, 0), (400, 0), (176, 0)]
-    assert station.violations == []
+    assert (station.violations, station.events) == ([], ["connected"])
     running.cancel()
     await asyncio.wait([running])
     server.close()

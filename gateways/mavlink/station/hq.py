@@ -10,9 +10,9 @@ from typing import Any
 
 from gateways.mavlink.frames import MavlinkFrame
 from gateways.mavlink.messages import MavlinkMessage, control
-from gateways.mavlink.numbers import AUTOPILOT, Severity
+from gateways.mavlink.numbers import AUTOPILOT, RoverMode, Severity
 from gateways.mavlink.station import answers, commands, driving
-from gateways.mavlink.station.driving import RELEASE, VELOCITY_ONLY, is_deflected
+from gateways.mavlink.station.driving import RELEASE, VELOCITY_ONLY
 from gateways.mavlink.station.options import MavlinkHqOptions
 from gateways.mavlink.station.parameters import Parameters
 from gateways.mavlink.station.session import Station
@@ -23,6 +23,8 @@ from zbridge.fleet.view import RobotView
 from zbridge.protocol import HqSide, Limits, Metrics, Send, Telemetry
 
 DEADMAN_S = 0.5
+_CENTRE = ": centre the joystick first"
+"""How the core asks for a neutral."""
 UNKNOWN = "messages of unknown ids"
 NOT_OURS = "messages to another vehicle"
 
@@ -95,11 +97,12 @@ class MavlinkHq(HqSide):
     def tell(self, session: Station, text: str, now: float) -> None:
         for prefix in ("not driving: ", "drive: "):
             text = text.removeprefix(prefix)
+        if text.endswith(_CENTRE):
+            again = f"{text.removesuffix(_CENTRE)}: choose GUIDED again"
+            text = again if session.mode == RoverMode.GUIDED else RELEASE
         session.text(text)
 
     def not_driving(self, session: Station, now: float) -> None:
-        if is_deflected(session):
-            session.warn(RELEASE)
         session.rest(now)
 
     # What they order, and ask for

@@ -14,6 +14,7 @@ from gateways.mavlink.station.options import MavlinkHqOptions, Origin
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Battery, Control, Drive, FleetMessage, Latch, Motion, Pose, Scan, Status, Stop, Text
 from zbridge.fleet.view import RobotView
+from zbridge.lease.stick import StickRules
 from zbridge.protocol import Limits, Telemetry
 
 os.environ["MAVLINK20"] = "1"
@@ -112,7 +113,7 @@ class Scene:
     def publishes(self, path: str, message: FleetMessage) -> None:
         topic = topics.find(path)
         assert topic is not None
-        assert (path in self.side.follows or path == "status")
+        assert path in self.side.follows or path == "status"
         self.view.note(topic, message)
         self.send(self.side.show(topic, message))
 
@@ -468,6 +469,18 @@ def test_refused_motion_is_shown_by_the_armed_bit_at_once() -> None:
     assert (beat.custom_mode, beat.base_mode & 128) == (HOLD, 0)
     assert ground.texts[-1] == "held by ann"
     assert not ground.aims(1.0)
+
+
+@pytest.mark.parametrize(
+    ("mode", "text"),
+    [(GUIDED, "deadman: choose GUIDED again"), (MANUAL, "release the stick (QGC: centre is zero throttle)")],
+)
+def test_a_client_that_owes_neutral_is_told_what_to_do(mode: int, text: str) -> None:
+    scene = Scene()
+    (ground,) = scene.stations
+    ground.mode(mode)
+    scene.side.tell(ground.session, f"deadman{StickRules().advice}", scene.now)
+    assert ground.texts == [text]
 
 
 def test_motion_that_does_not_change_may_be_ended() -> None:

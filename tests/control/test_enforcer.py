@@ -19,6 +19,7 @@ from zbridge.control.enforcer import SUSPENDED_S, Enforcer
 from zbridge.control.events import CommandSender, StopCause
 from zbridge.control.faults import OpenFaults
 from zbridge.control.motion_limits import MotionLimits
+from zbridge.control.settings import LEAST_IDLE_STOP_S
 from zbridge.control.standstill import Standstill
 from zbridge.errors import NeutralFirst, RateLimited
 from zbridge.fleet import payload as payloads
@@ -34,7 +35,7 @@ LATCHING = payloads.encode(Stop(latch=True, id=bytes(16), who="bob", reason="wet
 
 
 class Rig:
-    def __init__(self, limits: MotionLimits | None = None) -> None:
+    def __init__(self, limits: MotionLimits | None = None, idle_stop_s: float = 0.0) -> None:
         self.now, self.suspended_s = 100.0, 7200.0
         self.machine = Machine()
         self.shown: list[FleetMessage] = []
@@ -54,8 +55,8 @@ class Rig:
             clock_ns=time.time_ns,
             suspended_s=lambda: self.suspended_s,
         )
-        standstill = Standstill(context, self.authority, 0.0)
-        self.enforcer = Enforcer(context, self.authority, standstill, Audit("r1", lambda line: None), limits)
+        self.standstill = Standstill(context, self.authority, idle_stop_s)
+        self.enforcer = Enforcer(context, self.authority, self.standstill, Audit("r1", lambda line: None), limits)
         assert self.authority.acquire(Acquire(who="a"), self.now).ok
         self.enforcer.settle()
 
@@ -79,6 +80,34 @@ async def test_a_gateway_frozen_past_the_deadman_stops_the_robot_before_it_write
     assert rig.machine.stops == 1
     with pytest.raises(NeutralFirst):
         rig.enforcer.permit(FORWARD, rig.now)
+
+
+async def test_a_robot_learns_whether_somebody_ordered_its_stop(monkeypatch) -> None:
+    rig, asked = Rig(), []
+    monkeypatch.setattr(rig.machine, "stop", lambda now, until: asked.append("stop"))
+    monkeypatch.setattr(rig.machine, "rest", lambda now, until: asked.append("rest"))
+    rig.standstill.stop(ordered=False)  # as for a new connection
+    rig.drive()
+    rig.now += DEADMAN_S + 0.1
+    rig.enforcer.keep_time()
+    rig.enforcer.stop_commanded(Sample("fleet/r1/@cmd/stop", b""))
+    rig.enforcer.stop_commanded(Sample("fleet/r1/@cmd/stop", LATCHING))
+    rig.standstill.stop(ordered=False)  # a latch is in force
+    assert asked == ["rest", "rest", "stop", "stop", "stop"]
+
+
+@pytest.mark.parametrize("latched", [False, True])
+async def test_a_robot_that_nobody_drives_is_stopped_by_order_while_a_latch_is_in_force(monkeypatch, latched) -> None:
+    rig, asked = Rig(idle_stop_s=LEAST_IDLE_STOP_S), []
+    if latched:
+        rig.enforcer.stop_commanded(Sample("fleet/r1/@cmd/stop", LATCHING))
+        rig.now += 10.0
+    monkeypatch.setattr(rig.machine, "stop", lambda now, until: asked.append("stop"))
+    monkeypatch.setattr(rig.machine, "rest", lambda now, until: asked.append("rest"))
+    rig.standstill.begin()
+    await asyncio.sleep(LEAST_IDLE_STOP_S * 1.5)
+    rig.standstill.close()
+    assert asked == ["stop" if latched else "rest"]
 
 
 @pytest.mark.parametrize("cause", ["deadman", "latch"])

@@ -22,7 +22,7 @@ from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
 from zbridge.control.context import RobotContext
 from zbridge.control.event_counts import EventCounts
-from zbridge.control.events import CommandSender, EventKind, StopCause
+from zbridge.control.events import ORDERED, CommandSender, EventKind, StopCause
 from zbridge.control.faults import EventFaults
 from zbridge.control.latch import Latches, LatchRecord, read_stop
 from zbridge.control.lease_hook import LeaseHook
@@ -173,7 +173,7 @@ class Enforcer:
             self._remind()
             self._save_latches()
             if not self.authority.motion.driven:
-                self._send_stop()
+                self._send_stop(ordered=False)
 
     def restore(self, latches: Latches) -> None:
         """Take over what was written down, before the robot is served; raise ProtocolError."""
@@ -252,7 +252,7 @@ class Enforcer:
                     if event.what is not EventKind.ACQUIRED and self._limits is not None:
                         self._limits.stopped()
                 if event.stops:
-                    self._send_stop()
+                    self._send_stop(ordered=event.cause in ORDERED)
                 if event.what in (EventKind.LATCHED, EventKind.UNLATCHED):
                     self._save_latches()
                     self._faults.latched(self.authority.latches.in_force)
@@ -287,12 +287,12 @@ class Enforcer:
             except Exception as error:
                 self._context.faults.note("was_autonomous", error)
 
-    def _send_stop(self) -> None:
+    def _send_stop(self, *, ordered: bool) -> None:
         session = self._context.robot.driving
         if session is None or session.state is not State.ESTABLISHED:
             return
         try:
-            self._standstill.stop()
+            self._standstill.stop(ordered=ordered)
         except Refused as refusal:
             self.authority.refuse("stop", refusal)
 

@@ -85,6 +85,10 @@ class StopCause(StrEnum):
     """The gateway's machine slept."""
 
 
+ORDERED = frozenset({StopCause.COMMAND, StopCause.LATCH})
+"""The causes of stops that somebody ordered: all others only end what this gateway has begun."""
+
+
 class EventKind(Enum):
     """What happened to the right to drive."""
 

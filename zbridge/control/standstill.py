@@ -59,10 +59,13 @@ class Standstill:
         """Note that the session repeats neutral from now on: no stop is needed meanwhile."""
         self._repeated_until = now + STOP_REPEAT_S
 
-    def stop(self) -> None:
-        """Send the robot its stop at once and for a second; raise Refused if it cannot be sent."""
+    def stop(self, *, ordered: bool) -> None:
+        """Send the robot its stop at once and for a second; raise Refused if it cannot be sent.
+
+        ordered: somebody wants it stopped now, or a latch is in force; else as :meth:`RobotSide.rest` says.
+        """
         now = self._clock()
-        self._send(now, now + STOP_REPEAT_S)
+        self._send(now, now + STOP_REPEAT_S, ordered=ordered or bool(self._authority.latches))
         self._repeated_until = now + STOP_REPEAT_S
 
     def _period_s(self) -> float:
@@ -74,18 +77,19 @@ class Standstill:
             self._context.faults.note("idle_stop_s", error)
             return wanted_s
 
-    def _send(self, now: float, until: float) -> None:
+    def _send(self, now: float, until: float, *, ordered: bool) -> None:
         try:
-            self._write(now, until)
+            self._write(now, until, ordered)
         except Refused as refusal:
             self._context.open_faults.set(FaultCode.CANNOT_STOP, f"cannot be stopped: {refusal}")
             raise
         self._context.open_faults.set(FaultCode.CANNOT_STOP, None)
         self._context.pump()
 
-    def _write(self, now: float, until: float) -> None:
+    def _write(self, now: float, until: float, ordered: bool) -> None:
+        robot = self._context.robot
         try:
-            self._context.robot.stop(now, until)
+            (robot.stop if ordered else robot.rest)(now, until)
         except Refused:
             raise
         except Exception as error:
@@ -102,6 +106,6 @@ class Standstill:
             and now >= self._repeated_until
         ):
             try:
-                self._send(now, now)
+                self._send(now, now, ordered=bool(self._authority.latches))
             except Refused:
                 return  # the condition says so on status

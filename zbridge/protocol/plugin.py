@@ -89,6 +89,14 @@ class RobotSide(Kept, ABC):
     def stop(self, now: float, until: float) -> None:
         """Send the robot its stop before anything else, and repeat it until ``until``; once if ``until`` is ``now``."""
 
+    def rest(self, now: float, until: float) -> None:
+        """Stop the robot although nobody ordered it: see :meth:`stop`, which is called unless this is overridden.
+
+        Called while nobody drives, for a new connection, and when motion ends by itself: the driver is silent or lost,
+        the robot is not ready. Override for a robot that others may drive too: leave it alone once they do.
+        """
+        self.stop(now, until)
+
     def was_autonomous(self) -> None:
         """Record that the robot was ordered to move by itself, perhaps by another gateway: stops must end that too.
 

@@ -350,7 +350,7 @@ class RobotDevice(Transferable):
             if self._crashed:  # what waited then may have been written since, and may be motion
                 session.outbox.forget()
                 with contextlib.suppress(Refused):
-                    self._standstill.stop()
+                    self._standstill.stop(ordered=False)
                 self.enforcer.lease_hook.notify(anew=True)
 
     async def resume(self) -> None:

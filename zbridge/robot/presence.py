@@ -153,7 +153,7 @@ class Presence:
         self._greeted = session
         self._context.open_faults.set(FaultCode.ROBOT_LOST, None, quiet=True)
         with contextlib.suppress(Refused):  # the condition says so on status
-            self._standstill.stop()
+            self._standstill.stop(ordered=False)
         self._enforcer.lease_hook.notify(anew=True)
         for topic, message in self._context.robot.begun(self._context.clock_ns()):
             self._context.publish(topic, message)

@@ -115,15 +115,19 @@ class Scene:
         return outcome
 
     def stop(self, repeated_s: float = STOPPED_S) -> None:
-        """Stop the robot, as the gateway does."""
+        """Stop the robot, as the gateway does when somebody orders it."""
         self.robot.stop(self.now, self.now + repeated_s)
+
+    def rest(self, repeated_s: float = STOPPED_S) -> None:
+        """Stop the robot, as the gateway does of itself; 0: as once a second while nobody drives."""
+        self.robot.rest(self.now, self.now + repeated_s)
 
     def _follow_busy(self) -> None:
         """Stop a robot that has become busy, or is no longer."""
         if self.session.busy != self._busy and not self.session.over:
             self._busy, self._needs_neutral = self.session.busy, True
             with contextlib.suppress(Refused):
-                self.stop()
+                self.rest()
 
     def _hear(self, data: bytes) -> None:
         if not self.answers or not data:
@@ -141,7 +145,7 @@ class Scene:
             return
         self._greeted = True
         with contextlib.suppress(Refused):
-            self.stop()
+            self.rest()
         with contextlib.suppress(Refused):
             self.robot.leased(self._leased, self.now)
         self.shown |= {topic.path: shown for topic, shown in self.robot.begun(round(self.now * _NS_PER_S))}

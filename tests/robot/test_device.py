@@ -71,6 +71,16 @@ async def test_the_robot_speaks_first_and_its_settings_are_answered_and_shown() 
         assert status["links"] == [peer]
 
 
+async def test_a_warning_of_the_session_is_shown_and_forbids_nothing() -> None:
+    async with established() as rig:
+        rig.conversations[-1].session.warnings = ("it drives on for 3 s",)
+        await asyncio.sleep(HEARTBEAT_S)
+        assert rig.last("status")["reason"] == "it drives on for 3 s"
+        rig.command("drive", {"forward": 1.0})
+        await asyncio.sleep(0.05)
+        assert rig.written()
+
+
 async def test_an_unreachable_robot_shows_the_reason_every_second_and_is_tried_ever_more_rarely() -> None:
     async with serving(unreachable="no route") as rig:
         assert (rig.last("status")["state"], rig.last("status")["reason"]) == ("offline", "no route")

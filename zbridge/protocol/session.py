@@ -99,6 +99,8 @@ class Session(Kept, ABC, Generic[M]):
         """Why the peer accepts no commands now although the session is established; None: it accepts them."""
         self.doubts: tuple[str, ...] = ()
         """Signs that the connection loses or alters what is sent on it."""
+        self.warnings: tuple[str, ...] = ()
+        """What people should know of the robot, on the next ``status``; it is driven all the same."""
         self.version: str | None = None
         self.features: tuple[str, ...] = ()
         self.transport = "tcp"
@@ -381,12 +383,13 @@ def _agree(session: Session[Any], reason: str, now: float) -> None:
 
 
 def _leave(session: Session[Any], reason: str, now: float) -> None:
-    session.reason, session.busy, session.doubts = reason, None, ()
+    session.reason, session.busy, session.doubts, session.warnings = reason, None, (), ()
     session._limit_at = now + LINGER_S
 
 
 def _end(session: Session[Any], reason: str, now: float) -> None:
-    session.reason, session.busy, session.doubts = session.reason or reason, None, ()
+    session.reason, session.busy = session.reason or reason, None
+    session.doubts = session.warnings = ()
 
 
 _ACTIONS: dict[SessionEvent, Callable[[Session[Any], str, float], None]] = {

@@ -119,7 +119,8 @@ class Presence:
         session = context.robot.driving
         agreed = session if session is not None and first.state == "established" else None
         self._shown_doubts = agreed.doubts if agreed is not None else ()
-        reasons = (first.reason, *self._shown_doubts, *context.open_faults.texts)
+        warnings = agreed.warnings if agreed is not None else ()
+        reasons = (first.reason, *self._shown_doubts, *warnings, *context.open_faults.texts)
         context.publish(
             topics.STATUS,
             Status(

@@ -1,1 +1,153 @@
-"""MAVLink, message set ``common`` of ArduPilot: so far the codec, which no gateway uses yet."""
+"""MAVLink 2, message set ``common`` of ArduPilot: ground rovers and boats.
+
+``frames``, ``messages`` and ``numbers`` are the wire, ``session`` what both roles share, ``texts`` STATUSTEXT. ``rover`` is
+the device side: the gateway as the ground station of an ArduRover. ``simulator`` is a simulated rover.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+from gateways.mavlink.frames import HEADER, MARKER, frame_end, frame_of, read_frame, write_frame
+from gateways.mavlink.messages import MESSAGES, MavlinkMessage, control, telemetry
+from gateways.mavlink.rover.options import RoverOptions
+from zbridge.fleet.messages import Drive
+from zbridge.protocol import Codec, Example, Metrics, Protocol, ProtocolError, RobotSide, Simulation
+
+TEMPLATE = """\
+[device]
+protocol = "mavlink"
+connect = ["tcp://127.0.0.1:5760"]      # or ["serial:///dev/ttyUSB0?baud=57600"]
+
+[device.options]
+system_id = 255                         # ours; sticks count only from the rover's MAV_GCS_SYSID
+# component_id = 190                    # ours
+# vehicle_id = 1                        # the rover's; left out: the first rover or boat on the link
+drive = "guided"                        # setpoints in mode GUIDED; "manual": sticks in mode MANUAL, without a GPS
+arm = "operator"                        # who arms it; "drive": the first motion does
+speed_full_m_s = 1.0                    # the speed of a drive of 1; WP_SPEED of the rover limits it
+turn_full_rad_s = 1.0                   # the turn of a drive of 1
+# position_hz = 5.0                     # how often position and attitude are asked for; 0: never
+# ranges_hz = 5.0                       # distances; a radio of 57600 baud carries few
+# status_hz = 1.0                       # battery and fix
+"""
+
+
+def _read(frame: bytes) -> MavlinkMessage:
+    found = read_frame(frame)
+    if found.message is None:
+        raise ProtocolError(f"message {found.message_id} is not declared")
+    return found.message
+
+
+def _seal(frame: bytes) -> bytes:
+    """Make a damaged frame whole: its marker, flags, length and checksum."""
+    head = frame[:HEADER].ljust(HEADER, b"\0")
+    message_id = int.from_bytes(head[7:10], "little")
+    if message_id not in MESSAGES:
+        return bytes((MARKER,)) + frame[1:]
+    payload = frame[HEADER:-2][:255]
+    return frame_of(message_id, payload, MESSAGES[message_id].crc_extra, head[4], head[5], head[6])
+
+
+def _codec(name: str, system: int, component: int, *messages: object) -> Codec:
+    write = partial(write_frame, seq=0, system=system, component=component)
+    return Codec(name, write, _read, frame_end, messages, _seal)
+
+
+def _robot(options: RoverOptions, links: int, metrics: Metrics) -> RobotSide:
+    from gateways.mavlink.rover.translate import RoverRobot  # loads numpy
+
+    return RoverRobot(options, links, metrics)
+
+
+async def _simulate(simulation: Simulation) -> None:
+    from gateways.mavlink.simulator import simulate
+
+    await simulate(simulation)
+
+
+_hex = bytes.fromhex
+_PAGE, _PYMAVLINK = "the protocol page", "pymavlink 2.4.50"
+_SETPOINT = control.SetPositionTargetLocalNed(
+    vx=0.5, yaw_rate=-0.25, type_mask=0x5C7, target_system=1, target_component=1, coordinate_frame=8
+)
+_ATTITUDE = _hex("fd1c00000001011e0000e803000000000000000000000000003f0000000000000000000080bef8b5")
+_CELLS = (12000).to_bytes(2, "little") + b"\xff" * 18
+EXAMPLES = (
+    Example(
+        "rover",
+        _hex("fd0900000001010000000f0000000a03c10403ac7c"),
+        telemetry.MavlinkHeartbeat(15, 10, 3, 0xC1, 4, 3),
+        {"sensor/armed.value": 1.0},
+        source=_PAGE,
+    ),
+    Example(
+        "station",
+        _hex("fd0b000000ffbe450000000006fff401000000000146e7"),
+        control.ManualControl(y=-250, z=500, target=1),
+        source=_PAGE,
+    ),
+    Example(
+        "station",
+        _hex("fd20000000ffbe4c00000000803f000080400000000000000000000000000000000000000000b00001010e93"),
+        control.CommandLong(1.0, 4.0, command=176, target_system=1, target_component=1),
+        source=_PAGE,
+    ),
+    Example(
+        "station",
+        _hex(
+            "fd35000000ffbe540000000000000000000000000000000000000000003f"
+            "000000000000000000000000000000000000000000000000000080bec705010108a165"
+        ),
+        _SETPOINT,
+        command=Drive(forward=0.5, turn=0.25),
+        source=_PYMAVLINK,
+    ),
+    Example(
+        "rover",
+        _ATTITUDE,
+        telemetry.Attitude(1000, yaw=0.5, yawspeed=-0.25),
+        {"motion.gyro": 0.25},  # z, the last of three
+        source=_PYMAVLINK,
+    ),
+    Example(
+        "rover",
+        _hex("fd0c0000000101200000e803000000000040000040c06905"),
+        telemetry.LocalPositionNed(1000, 2.0, -3.0),
+        {"pose.x": -3.0, "pose.y": 2.0, "pose.heading": math.pi / 2 - 0.5},
+        before=(_ATTITUDE,),
+        source=_PYMAVLINK,
+    ),
+    Example(
+        "rover",
+        _hex("fd24000000010193000000000000000000000000e02effffffffffffffffffffffffffffffffffff960000000050da9a"),
+        telemetry.BatteryStatus(voltages=_CELLS, current_battery=150, battery_remaining=80),
+        {"battery.voltage": 12.0, "battery.current": -1.5, "battery.level": 0.8},
+        source=_PYMAVLINK,
+    ),
+    Example(
+        "rover",
+        _hex("fd0d0000000101840000000000001400bc02fa000000027241"),
+        telemetry.DistanceSensor(0, 20, 700, 250, orientation=2),
+        {"sensor/distance_right.value": 2.5},
+        source=_PYMAVLINK,
+    ),
+)
+PROTOCOL = Protocol(
+    name="mavlink",
+    summary="MAVLink: rovers and boats with ArduPilot",
+    options=RoverOptions,
+    links=1,
+    robot=_robot,
+    simulate=_simulate,
+    simulated={"arm": "drive"},
+    template=TEMPLATE,
+    codecs=(
+        _codec("rover", 1, 1, *(spec.message for spec in MESSAGES.values())),
+        _codec("station", 255, 190, *(spec.message for spec in MESSAGES.values())),
+    ),
+    examples=EXAMPLES,
+    plausible={"battery.voltage": (3.0, 100.0), "battery.current": (-200.0, 200.0)},
+)

@@ -100,8 +100,10 @@ def frame_of(message_id: int, payload: bytes, crc_extra: bytes, seq: int, system
 
 
 def numbered(frame: bytes, seq: int) -> bytes:
-    """Return a frame that :func:`write_frame` wrote with another sequence number."""
-    spec = MESSAGES[frame[7] | frame[8] << 8 | frame[9] << 16]
+    """Return a frame that :func:`write_frame` wrote with another sequence number; what is no such frame as it is."""
+    spec = MESSAGES.get(frame[7] | frame[8] << 8 | frame[9] << 16) if len(frame) > HEADER else None
+    if spec is None:
+        return frame
     changed = b"".join((frame[1:_SEQ_AT], bytes((seq & 0xFF,)), frame[_SEQ_AT + 1 : -2]))
     return b"".join((frame[:1], changed, checksum(changed, spec.crc_extra).to_bytes(2, "little")))
 

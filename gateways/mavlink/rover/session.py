@@ -1,0 +1,209 @@
+"""The conversation with one ArduRover, as its ground station. Sans-IO.
+
+Source: "The gateway as HQ" of the protocol page. The rover is established when it was found, and lost when its
+HEARTBEAT did not come for 3 s; other messages are no sign of life. What others on the link send is counted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from typing import Any, ClassVar
+
+from gateways.mavlink.frames import MavlinkFrame, read_frame
+from gateways.mavlink.messages import MavlinkMessage
+from gateways.mavlink.messages.control import AutopilotVersion, CommandAck, CommandLong, ParamValue
+from gateways.mavlink.messages.telemetry import MavlinkHeartbeat
+from gateways.mavlink.numbers import (
+    ARDUPILOT,
+    ARMED,
+    AUTOPILOT,
+    BOAT,
+    CUSTOM_MODE,
+    NO_AUTOPILOT,
+    PX4,
+    ROVER,
+    STATION,
+    Command,
+    Result,
+    RoverMode,
+)
+from gateways.mavlink.rover.helm import STOP_S, Helm, HelmState
+from gateways.mavlink.rover.options import RoverOptions
+from gateways.mavlink.rover.requests import AGAIN_S, TRIES, RoverRequests, command_long, failsafe_warnings
+from gateways.mavlink.session import MavlinkSession
+from zbridge.protocol import KeepAlive, Limits, Role, State
+
+HANDSHAKE_S = 10.0
+BEATS = 2
+"""HEARTBEATs of a vehicle that was not configured: an ArduPilot may send its first one with a wrong id."""
+STOP_AGAIN_S = 0.2
+MOTION = "motion"
+"""The slot of motion and stops."""
+_MODE = "mode"
+_OTHERS, _UNDECLARED = "frames of other systems", "messages that are not known"
+_ALIVE = MavlinkHeartbeat(kind=STATION, autopilot=NO_AUTOPILOT, system_status=4, mavlink_version=3)
+
+
+class RoverSession(MavlinkSession[Any]):
+    """We play a ground station. vehicle: the system that is obeyed and driven; 0: not found yet."""
+
+    role = Role.HQ
+    lost_s = 3.0
+    keep_alive = KeepAlive(_ALIVE, period_s=1.0, watchdog_s=5.0)
+    handled = frozenset({MavlinkFrame, MavlinkHeartbeat, CommandAck, ParamValue, AutopilotVersion})
+    kept: ClassVar[dict[str, Any]] = {
+        "vehicle": int,
+        "warnings": tuple[str, ...],
+        "requests": RoverRequests,
+        "_beats": dict[int, int],
+        "_uid": tuple[int, bytes] | None,
+    }
+
+    def __init__(self, options: RoverOptions, helm: Helm) -> None:
+        super().__init__(options.system_id, options.component_id, Limits(frame_bytes=1, handshake_s=HANDSHAKE_S))
+        self.options, self.helm = options, helm
+        self.vehicle = 0
+        self.requests = RoverRequests(self, options)
+        self._beats: Counter[int] = Counter()
+        self._uid: tuple[int, bytes] | None = None
+        self._now = -math.inf
+        self._lives = False
+        """Whether the rover's HEARTBEAT is among what was just read."""
+
+    # Messages
+
+    def receive(self, data: bytes, now: float) -> list[Any]:
+        self._now = now
+        return super().receive(data, now)
+
+    def decode(self, frame: bytes) -> MavlinkFrame | MavlinkMessage:
+        """Return the message of a frame of the rover, and all other frames as they are."""
+        found = read_frame(frame)
+        if found.message is None or found.component != AUTOPILOT or found.system != self.vehicle:
+            return found
+        self.requests.heard[found.message_id] = self._now
+        return found.message
+
+    def accept(self, message: Any, now: float) -> bool:
+        match message:
+            case MavlinkFrame(message=MavlinkHeartbeat() as beat, component=1, system=system) if not self.vehicle:
+                self._find(system, beat, now)
+                return False
+            case MavlinkFrame():
+                self.left_out[_OTHERS if message.message is not None else _UNDECLARED] += 1
+                return False
+            case MavlinkHeartbeat():
+                self._lives = True
+                self.helm.show(message.custom_mode, armed=bool(message.base_mode & ARMED), now=now)
+                self._follow_helm()
+            case CommandAck(target_system=target) if target in (0, self.system):
+                self._answered(message, now)
+            case ParamValue():
+                self.requests.take(message)
+                self._warn()
+            case AutopilotVersion():
+                self._identify(message)
+        return True
+
+    def _heard(self, now: float) -> None:
+        if self._lives:
+            self._lives = False
+            super()._heard(now)
+
+    def overdue(self) -> str:
+        wanted = f"system {self.options.vehicle_id}" if self.options.vehicle_id else "a rover or boat"
+        others = f"; {self.left_out[_OTHERS]} frames of others" if self.left_out[_OTHERS] else ""
+        return f"no HEARTBEAT of {wanted} within {HANDSHAKE_S:g} s{others}"
+
+    def _find(self, system: int, beat: MavlinkHeartbeat, now: float) -> None:
+        """Establish the session once it is sure which system is the rover."""
+        wanted, is_rover = self.options.vehicle_id, beat.kind in (ROVER, BOAT)
+        if system != wanted if wanted is not None else not is_rover:
+            self.left_out[_OTHERS] += 1
+        elif beat.autopilot == PX4:
+            self.fail(f"vehicle {system} has a PX4 (autopilot 12): only ArduPilot is supported")
+        elif not is_rover or beat.autopilot != ARDUPILOT:
+            self.fail(f"vehicle {system} is of type {beat.kind}, autopilot {beat.autopilot}: expected an ArduRover")
+        else:
+            self._beats[system] += 1
+            if wanted is not None or self._beats[system] >= BEATS:
+                self.vehicle = system
+                self.helm.show(beat.custom_mode, armed=bool(beat.base_mode & ARMED), now=now)
+                self.establish("", ())
+                self.requests.begin(system, now)
+                self._follow_helm()
+
+    def _identify(self, message: AutopilotVersion) -> None:
+        number = message.flight_sw_version
+        self.version = f"{number >> 24}.{number >> 16 & 0xFF}.{number >> 8 & 0xFF}" if number else ""
+        uid = (message.uid, message.uid2)
+        if self._uid not in (None, uid):
+            self.busy = f"two vehicles have the id {self.vehicle}"
+        self._uid = uid
+
+    def _answered(self, message: CommandAck, now: float) -> None:
+        self.requests.answered(message.command, now)
+        if message.command in (Command.DO_SET_MODE, Command.ARM):
+            what = "arming" if message.command == Command.ARM else f"mode {self.helm.driving.name}"
+            self.helm.answer(what, accepted=message.result == Result.ACCEPTED)
+            self._follow_helm()
+
+    # Time
+
+    def timers(self) -> float:
+        return min(self.requests.due, self.helm.due) if self.state is State.ESTABLISHED else math.inf
+
+    def on_timer(self, now: float) -> None:
+        self.requests.expire(now)
+        self.helm.expire(now)
+        self._follow_helm()
+
+    def _follow_helm(self) -> None:
+        """Send nothing more into a mode that is not ours, and nothing that has been confirmed."""
+        state = self.helm.state
+        if state is not HelmState.ASKED:
+            self.outbox.clear(_MODE)
+        if not self.helm.ours or state is HelmState.HELD:
+            self.outbox.clear(MOTION)
+        self._warn()
+
+    def _warn(self) -> None:
+        if not self.over:
+            stops = (self.helm.warning,) if self.helm.warning else ()
+            self.warnings = (*failsafe_warnings(self.requests.parameters, self.options), *stops)
+
+    # Commands
+
+    def drive(self, message: MavlinkMessage, now: float, *, moving: bool, period_s: float) -> None:
+        """Send motion and repeat it, behind a request for our mode where needed; raise NotReady.
+
+        Neutral goes only into a mode that is ours.
+        """
+        if not moving:
+            if self.helm.release():
+                self.outbox.set(MOTION, (self.encode(message),), now, period_s=period_s)
+            return
+        if self.helm.engage(now):
+            asks = [self._mode(self.helm.driving)]
+            if self.helm.arms and not self.helm.armed:
+                asks.append(command_long(Command.ARM, 1.0, 0.0, self.vehicle))
+            until = now + AGAIN_S * (TRIES - 0.5)
+            frames = tuple(map(self.encode, asks))
+            self.outbox.set(_MODE, frames, -math.inf, period_s=AGAIN_S, until=until)  # before the motion
+            self.outbox.clear(MOTION)  # a stop that is repeated
+        self.outbox.set(MOTION, (self.encode(message),), now, period_s=period_s)
+
+    def halt(self, frames: tuple[bytes, ...], now: float, until: float) -> None:
+        """Send a stop, and repeat it until it is confirmed."""
+        self.helm.stop(now)
+        self.outbox.clear(_MODE)
+        until = min(until, now + STOP_S)
+        self.outbox.set(MOTION, frames, now, period_s=STOP_AGAIN_S, until=until, urgent=True)
+
+    def hold(self) -> bytes:
+        """Return the frame that asks for HOLD."""
+        return self.encode(self._mode(RoverMode.HOLD))
+
+    def _mode(self, mode: RoverMode) -> CommandLong:
+        return command_long(Command.DO_SET_MODE, float(CUSTOM_MODE), float(mode), self.vehicle)

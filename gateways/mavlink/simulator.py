@@ -1,0 +1,364 @@
+"""A simulated ArduRover in the simulated room. It starts in HOLD, disarmed, as a real one.
+
+Source: "What an ArduRover does" of the protocol page. It obeys what is sent to its own system or to all, sticks only
+from ``MAV_GCS_SYSID``. A ground station that is wrong is ignored in silence where a real rover does so.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from gateways.mavlink.frames import LIMIT_BYTES, MavlinkFrame, frame_end, read_frame, write_frame
+from gateways.mavlink.messages import MavlinkMessage, control, telemetry
+from gateways.mavlink.numbers import (
+    ARDUPILOT,
+    ARMED,
+    AUTOPILOT,
+    BODY_FRD,
+    BODY_NED,
+    BODY_OFFSET_NED,
+    CUSTOM_MODE,
+    FORCE_ARM,
+    ROVER,
+    STATION,
+    Command,
+    Result,
+    RoverMode,
+    Severity,
+)
+from gateways.mavlink.texts import chunks_of
+from zbridge.protocol import ProtocolError, Simulation, Truth
+from zbridge.simulation import SimulatedRobot, serve
+from zbridge.simulation.world import Body, cast
+from zbridge.wire import FrameBuffer
+
+FASTEST_M_S, FASTEST_RAD_S = 1.0, 1.0
+"""At full stick."""
+MOST_M_S = 2.0
+ACCELERATION_M_S2, COAST_M_S2 = 4.0, 1.5
+RADIUS_M = 0.25
+POINTS, RANGE_CM, NEAR_CM = 72, 800, 20
+HOME_LAT, HOME_LON = 473977420, 85455940
+FULL_MV, EMPTY_MV, EMPTY_S = 12600.0, 10500.0, 7200.0
+STEADY_HZ = 20.0
+"""Most often that a stream is sent."""
+IGNORED = 0x1C0 | 0x07
+"""Bits of ``type_mask`` that must be set: acceleration and position are not followed."""
+_VELOCITY, _YAW_RATE, _YAW = 0x08 | 0x10, 0x800, 0x400
+_STEERED = (RoverMode.MANUAL, RoverMode.ACRO, RoverMode.STEERING)
+_REFUSED_MODES = (RoverMode.INITIALISING,)
+_BEARINGS = np.radians(-180.0 + np.arange(POINTS) * 360.0 / POINTS)
+_M_PER_UNIT = 0.011131884502145034
+PARAMETERS = {
+    "FS_GCS_ENABLE": 0.0,
+    "FS_GCS_TIMEOUT": 5.0,
+    "FS_TIMEOUT": 1.5,
+    "GUID_TIMEOUT": 3.0,
+    "RC_OVERRIDE_TIME": 3.0,
+    "PILOT_STEER_TYPE": 0.0,
+    "MAV_GCS_SYSID": 255.0,
+}
+
+
+class ArduRover(SimulatedRobot):
+    """One rover, without a link. stick: forward and turn of its RC pilot. arming_fault: why it cannot be armed."""
+
+    def __init__(
+        self, place: tuple[float, float, float] | None = None, *, system: int = 1, **parameters: float
+    ) -> None:
+        self.body = Body.placed(place, radius=RADIUS_M)
+        self.system = system
+        self.parameters = PARAMETERS | parameters
+        self.mode, self.armed = RoverMode.HOLD, False
+        self.stick = (0.0, 0.0)
+        self.arming_fault: str | None = None
+        self.uid = 0x1234
+        self.received: list[MavlinkFrame] = []
+        """All that was sent to it."""
+        self._frames = FrameBuffer(frame_end, LIMIT_BYTES)
+        self._out = b""
+        self._seq = self._texts = 0
+        self._now = 0.0
+        self._beat_at = 0.0
+        self._target: tuple[float, float] | None = None
+        self._target_at = self._override_at = -math.inf
+        self._override = (0.0, 0.0)
+        self._gcs_at: float | None = None
+        self._intervals: dict[int, float] = {}
+        self._due: dict[int, float] = {}
+        self._speed = self._turn = 0.0
+        self._silent = False
+
+    # As its pilot, and its failures
+
+    def switch_mode(self, mode: RoverMode) -> None:
+        """Change the mode, as the switch of the RC transmitter does; HEARTBEAT shows it at once."""
+        if mode is not self.mode:
+            self.mode, self._target, self._silent = mode, None, False
+            self._beat()
+
+    def switch_arming(self, armed: bool) -> None:
+        """Arm or disarm, as the RC transmitter does."""
+        self.armed = armed
+        self._beat()
+
+    def say(self, text: str, severity: int = Severity.INFO) -> None:
+        """Send a STATUSTEXT."""
+        self._texts += 1
+        self.send(*chunks_of(text, severity, self._texts))
+
+    def send(self, *messages: MavlinkMessage) -> None:
+        """Send messages with the next answer, or step."""
+        for message in messages:
+            self._out += write_frame(message, self._seq, self.system, AUTOPILOT)
+            self._seq = (self._seq + 1) % 256
+
+    # As a simulated robot
+
+    def connected(self) -> bytes:
+        self._frames = FrameBuffer(frame_end, LIMIT_BYTES)
+        self._out, self._intervals = b"", {}
+        return b""
+
+    def receive(self, data: bytes) -> bytes:
+        for piece in self._frames.feed(data):
+            try:
+                frame = read_frame(piece)
+            except ProtocolError:
+                continue
+            self.received.append(frame)
+            target = getattr(frame.message, "target_system", getattr(frame.message, "target", 0))
+            if frame.message is not None and target in (0, self.system):
+                self._obey(frame.message, frame.system)
+        del self.received[:-1000]
+        return self._flush()
+
+    def step(self, dt: float) -> bytes:
+        self._now += dt
+        self._fail_safe()
+        self._move(dt)
+        for message_id, interval_s in self._intervals.items():
+            if self._now >= self._due[message_id]:
+                self._due[message_id] = self._now + interval_s - 1e-6
+                self.send(_STREAMS[message_id](self))
+        if self._now >= self._beat_at:
+            self._beat()
+            self._beat_at = self._now + 1.0 - 1e-6
+        return self._flush()
+
+    def truth(self) -> Truth:
+        neutral = self._wanted() == (0.0, 0.0)
+        return Truth(self.body.x, self.body.y, self.body.heading, neutral=neutral, watchdog=self._silent)
+
+    def _flush(self) -> bytes:
+        out, self._out = self._out, b""
+        return out
+
+    def _beat(self) -> None:
+        base = CUSTOM_MODE | (ARMED if self.armed else 0)
+        self.send(telemetry.MavlinkHeartbeat(int(self.mode), ROVER, ARDUPILOT, base, 4, 3))
+
+    # What it is sent
+
+    def _obey(self, message: MavlinkMessage, sender: int) -> None:
+        is_station = sender == self.parameters["MAV_GCS_SYSID"]
+        match message:
+            case telemetry.MavlinkHeartbeat(kind=kind) if kind == STATION and is_station:
+                self._gcs_at = self._now
+            case control.ManualControl() if is_station:
+                self._gcs_at = self._override_at = self._now
+                self._override = (message.z / 1000, -message.y / 1000)
+            case control.SetPositionTargetLocalNed() if self.mode is RoverMode.GUIDED:
+                self._follow(message)
+            case control.ParamRequestRead():
+                self._tell(message.param_id.partition(b"\0")[0].decode("ascii", "replace"))
+            case control.ParamRequestList():
+                for name in self.parameters:
+                    self._tell(name)
+            case control.CommandLong():
+                result = self._command(message)
+                self.send(control.CommandAck(message.command, result, target_system=sender))
+
+    def _tell(self, name: str) -> None:
+        if name in self.parameters:
+            index, count = list(self.parameters).index(name), len(self.parameters)
+            self.send(control.ParamValue(self.parameters[name], count, index, name.encode(), 9))
+
+    def _follow(self, message: control.SetPositionTargetLocalNed) -> None:
+        """Drive at a velocity. Backward only with a yaw or a yaw rate: else it would turn round, and drive ahead."""
+        mask = message.type_mask
+        if message.coordinate_frame not in (BODY_NED, BODY_OFFSET_NED) or mask & IGNORED != IGNORED or mask & _VELOCITY:
+            return
+        turns = not mask & _YAW_RATE
+        forward = message.vx if turns or not mask & _YAW else abs(message.vx)
+        self._target = (max(-MOST_M_S, min(MOST_M_S, forward)), -message.yaw_rate if turns else 0.0)
+        self._target_at, self._silent = self._now, False
+
+    def _command(self, message: control.CommandLong) -> Result:
+        match message.command:
+            case Command.DO_SET_MODE:
+                mode = int(message.param2)
+                if mode not in set(RoverMode) or mode in _REFUSED_MODES:
+                    return Result.FAILED
+                self.switch_mode(RoverMode(mode))
+            case Command.ARM:
+                return self._arm(message.param1 == 1.0, forced=message.param2 == FORCE_ARM)
+            case Command.SET_MESSAGE_INTERVAL:
+                return self._set_interval(int(message.param1), message.param2)
+            case Command.REQUEST_MESSAGE if int(message.param1) in _STREAMS:
+                self.send(_STREAMS[int(message.param1)](self))
+            case Command.GET_HOME_POSITION:
+                self.send(self._home())
+            case _:
+                return Result.UNSUPPORTED
+        return Result.ACCEPTED
+
+    def _arm(self, wanted: bool, *, forced: bool) -> Result:
+        if wanted and not self.armed and not forced and self.arming_fault:
+            self.say(f"Arm: {self.arming_fault}", Severity.WARNING)
+            return Result.FAILED
+        if wanted is not self.armed:
+            self.say("Throttle armed" if wanted else "Throttle disarmed")
+        self.switch_arming(wanted)
+        return Result.ACCEPTED
+
+    def _set_interval(self, message_id: int, interval_us: float) -> Result:
+        if message_id not in _STREAMS:
+            return Result.FAILED
+        if interval_us > 0:
+            self._intervals[message_id] = max(1 / STEADY_HZ, interval_us / 1e6)
+            self._due[message_id] = self._now
+        else:
+            self._intervals.pop(message_id, None)
+        return Result.ACCEPTED
+
+    # How it moves
+
+    def _fail_safe(self) -> None:
+        """Carry out the failsafe of the ground station, and the time limit of targets."""
+        if self._gcs_at is not None and self.parameters["FS_GCS_ENABLE"] and self.mode is not RoverMode.HOLD:
+            limit_s = self.parameters["FS_GCS_TIMEOUT"] + self.parameters["FS_TIMEOUT"]
+            if self._now - self._gcs_at > limit_s:
+                self.say("GCS Failsafe", Severity.WARNING)
+                self.switch_mode(RoverMode.HOLD)
+                self._override_at, self._silent = -math.inf, True
+        limit_s = self.parameters["GUID_TIMEOUT"]
+        if self._target is not None and self._now - self._target_at > limit_s:
+            self._silent = self._target != (0.0, 0.0)
+            self._target = None
+            self.say(f"target not received last {limit_s:.1f}secs, stopping", Severity.WARNING)
+
+    def _wanted(self) -> tuple[float, float]:
+        """Return the speed, m/s, and the turn rate, rad/s, that its mode wants; the throttle is off while disarmed."""
+        if not self.armed:
+            return 0.0, 0.0
+        if self.mode is RoverMode.GUIDED:
+            return self._target or (0.0, 0.0)
+        if self.mode in _STEERED:
+            overridden = self._now - self._override_at <= self.parameters["RC_OVERRIDE_TIME"]
+            forward, turn = self._override if overridden else self.stick
+            if forward < 0 and self.parameters["PILOT_STEER_TYPE"] in (0.0, 2.0):
+                turn = -turn
+            return forward * FASTEST_M_S, turn * FASTEST_RAD_S
+        return (0.3, 0.2) if self.mode is RoverMode.AUTO else (0.0, 0.0)
+
+    def _move(self, dt: float) -> None:
+        """Accelerate, brake in GUIDED, coast where the throttle is off."""
+        speed, self._turn = self._wanted()
+        coasts = not self.armed or self.mode is RoverMode.HOLD
+        most = (COAST_M_S2 if coasts else ACCELERATION_M_S2) * dt
+        self._speed += max(-most, min(most, speed - self._speed))
+        self.body.step(self._speed, 0.0, self._turn, dt)
+        if self.body.blocked:
+            self._speed = 0.0
+
+    # What it measures
+
+    @property
+    def _ms(self) -> int:
+        return round(self._now * 1000)
+
+    @property
+    def _yaw(self) -> float:
+        return math.remainder(math.pi / 2 - self.body.heading, 2 * math.pi)
+
+    def _velocity(self) -> tuple[float, float]:
+        return self._speed * math.cos(self._yaw), self._speed * math.sin(self._yaw)
+
+    def _attitude(self) -> MavlinkMessage:
+        return telemetry.Attitude(self._ms, yaw=self._yaw, yawspeed=-self._turn)
+
+    def _local_position(self) -> MavlinkMessage:
+        north, east = self._velocity()
+        return telemetry.LocalPositionNed(self._ms, self.body.y, self.body.x, vx=north, vy=east)
+
+    def _global_position(self) -> MavlinkMessage:
+        lat = HOME_LAT + round(self.body.y / _M_PER_UNIT)
+        lon = HOME_LON + round(self.body.x / _M_PER_UNIT / math.cos(math.radians(HOME_LAT / 1e7)))
+        north, east = (round(speed * 100) for speed in self._velocity())
+        hdg = round(math.degrees(self._yaw) * 100) % 36000
+        return telemetry.GlobalPositionInt(self._ms, lat, lon, 488000, 0, north, east, hdg=hdg)
+
+    def _gps(self) -> MavlinkMessage:
+        return telemetry.GpsRawInt(self._ms * 1000, HOME_LAT, HOME_LON, 488000, fix_type=3, satellites_visible=12)
+
+    def _hud(self) -> MavlinkMessage:
+        heading = round(math.degrees(self._yaw)) % 360
+        return telemetry.VfrHud(abs(self._speed), abs(self._speed), heading=heading)
+
+    def _obstacles(self) -> MavlinkMessage:
+        """Measure around, clockwise from behind."""
+        metres = cast(self.body.x, self.body.y, self.body.heading - _BEARINGS, RANGE_CM / 100 + 0.01)
+        cm = np.rint(metres * 100).astype("<u2")
+        return telemetry.ObstacleDistance(
+            self._ms * 1000, cm.tobytes(), NEAR_CM, RANGE_CM, 0, 5, 5.0, angle_offset=-180.0, frame=BODY_FRD
+        )
+
+    def _distance(self) -> MavlinkMessage:
+        (ahead,) = cast(self.body.x, self.body.y, np.array([self.body.heading]), RANGE_CM / 100)
+        return telemetry.DistanceSensor(self._ms, NEAR_CM, RANGE_CM, round(ahead * 100))
+
+    def _millivolts(self) -> int:
+        return round(FULL_MV - (FULL_MV - EMPTY_MV) * min(1.0, self._now / EMPTY_S))
+
+    def _percent(self) -> int:
+        return round(100 * (1 - min(1.0, self._now / EMPTY_S)))
+
+    def _system(self) -> MavlinkMessage:
+        return telemetry.SysStatus(
+            voltage_battery=self._millivolts(), current_battery=150, battery_remaining=self._percent()
+        )
+
+    def _battery(self) -> MavlinkMessage:
+        cells = np.array([self._millivolts(), *(9 * [65535])], "<u2").tobytes()
+        return telemetry.BatteryStatus(voltages=cells, current_battery=150, battery_remaining=self._percent())
+
+    def _version(self) -> MavlinkMessage:
+        return control.AutopilotVersion(uid=self.uid, flight_sw_version=4 << 24 | 5 << 16 | 1 << 8 | 255)
+
+    def _home(self) -> MavlinkMessage:
+        return telemetry.HomePosition(HOME_LAT, HOME_LON, 488000)
+
+
+_STREAMS: dict[int, Callable[[ArduRover], Any]] = {
+    1: ArduRover._system,
+    24: ArduRover._gps,
+    30: ArduRover._attitude,
+    32: ArduRover._local_position,
+    33: ArduRover._global_position,
+    74: ArduRover._hud,
+    132: ArduRover._distance,
+    147: ArduRover._battery,
+    148: ArduRover._version,
+    242: ArduRover._home,
+    330: ArduRover._obstacles,
+}
+
+
+async def simulate(simulation: Simulation) -> None:
+    """Serve one rover on a TCP port until cancelled."""
+    await serve(simulation, ArduRover(simulation.place))

@@ -1,19 +1,35 @@
-"""MAVLink 2, message set ``common`` of ArduPilot: ground rovers and boats.
+"""MAVLink 2, message set ``common`` of ArduPilot: ground rovers and boats, and ground stations.
 
-``frames``, ``messages`` and ``numbers`` are the wire, ``session`` what both roles share, ``texts`` STATUSTEXT. ``rover`` is
-the device side: the gateway as the ground station of an ArduRover. ``simulator`` is a simulated rover.
+``frames``, ``messages`` and ``numbers`` are the wire, ``session`` what both roles share, ``texts`` STATUSTEXT. In
+``rover`` the gateway is the ground station of an ArduRover, in ``station`` an ArduRover for ground stations.
+``simulator`` is a simulated rover; ``conformance`` has peers as fragile as deployed ones, which share no code with the
+rest.
 """
 
 from __future__ import annotations
 
 import math
 from functools import partial
+from typing import cast, get_args
 
 from gateways.mavlink.frames import HEADER, MARKER, frame_end, frame_of, read_frame, write_frame
 from gateways.mavlink.messages import MESSAGES, MavlinkMessage, control, telemetry
 from gateways.mavlink.rover.options import RoverOptions
+from gateways.mavlink.station.options import MavlinkHqOptions
 from zbridge.fleet.messages import Drive
-from zbridge.protocol import Codec, Example, Metrics, Protocol, ProtocolError, RobotSide, Simulation
+from zbridge.fleet.view import RobotView
+from zbridge.protocol import (
+    Codec,
+    ConfigError,
+    Example,
+    HqSide,
+    HqSimulation,
+    Metrics,
+    Protocol,
+    ProtocolError,
+    RobotSide,
+    Simulation,
+)
 
 TEMPLATE = """\
 [device]
@@ -31,6 +47,18 @@ turn_full_rad_s = 1.0                   # the turn of a drive of 1
 # position_hz = 5.0                     # how often position and attitude are asked for; 0: never
 # ranges_hz = 5.0                       # distances; a radio of 57600 baud carries few
 # status_hz = 1.0                       # battery and fix
+"""
+HQ_TEMPLATE = """\
+protocol = "mavlink"
+listen = "tcp://127.0.0.1:5762"         # ground stations connect here
+[hq.options]
+system_id = 1                           # 1 to 250, of this robot alone: ground stations take two of one id for one
+kind = "rover"                          # or "boat"
+speed_full_m_s = 1.0                    # the speed of a drive of 1, for setpoints
+turn_full_rad_s = 1.0                   # the turn of a drive of 1
+# origin = { latitude = 48.2, longitude = 11.6, altitude = 0.0, compass = 90.0 }   # of the map; compass: of its +x
+dead = 60                               # thousandths of a stick that are zero
+stale_s = 0.0                           # ends motion that has not changed for so long; 0: never
 """
 
 
@@ -62,10 +90,34 @@ def _robot(options: RoverOptions, links: int, metrics: Metrics) -> RobotSide:
     return RoverRobot(options, links, metrics)
 
 
-async def _simulate(simulation: Simulation) -> None:
-    from gateways.mavlink.simulator import simulate
+def _hq(options: MavlinkHqOptions, view: RobotView, metrics: Metrics) -> HqSide:
+    from gateways.mavlink.station.hq import MavlinkHq  # loads numpy
 
-    await simulate(simulation)
+    return MavlinkHq(options, view, metrics)
+
+
+async def _simulate(simulation: Simulation) -> None:
+    if simulation.fragile:
+        from gateways.mavlink.conformance.fragile_robot import FragileRover
+
+        await FragileRover(seed=simulation.seed).simulate(simulation.addresses, simulation.ready)
+    else:
+        from gateways.mavlink.simulator import simulate
+
+        await simulate(simulation)
+
+
+async def _simulate_hq(simulation: HqSimulation) -> None:
+    from gateways.mavlink.conformance.fragile_hq import FragileStation
+    from gateways.mavlink.conformance.programs import Program
+
+    program, programs = simulation.dialect or "mavproxy", get_args(Program)
+    if program not in programs:
+        raise ConfigError(f"dialect {program!r}: expected one of {', '.join(programs)}")
+    if simulation.version is not None or simulation.udp:
+        raise ConfigError("ground stations have no versions, and no datagrams beside TCP")
+    station = FragileStation(cast(Program, program))
+    await station.simulate(simulation.address.host, simulation.address.port, simulation.drive)
 
 
 _hex = bytes.fromhex
@@ -143,7 +195,11 @@ PROTOCOL = Protocol(
     robot=_robot,
     simulate=_simulate,
     simulated={"arm": "drive"},
+    hq=_hq,
+    hq_options=MavlinkHqOptions,
+    simulate_hq=_simulate_hq,
     template=TEMPLATE,
+    hq_template=HQ_TEMPLATE,
     codecs=(
         _codec("rover", 1, 1, *(spec.message for spec in MESSAGES.values())),
         _codec("station", 255, 190, *(spec.message for spec in MESSAGES.values())),

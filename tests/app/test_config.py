@@ -114,6 +114,10 @@ def test_a_folder_that_does_not_fit_is_told(tmp_path: Path, bus: str, bundled: s
     assert str(raised.value).startswith(f"{file}: ")
 
 
+REQUIRED = {"mavlink": {"system_id": 1}}
+"""Options of listeners that have no default."""
+
+
 @pytest.mark.parametrize("name", protocol_names())
 def test_the_templates_of_every_protocol_are_configurations_with_all_defaults(tmp_path: Path, name: str) -> None:
     protocol = find_protocol(name)
@@ -123,7 +127,11 @@ def test_the_templates_of_every_protocol_are_configurations_with_all_defaults(tm
         return
     made = loaded(tmp_path, listener_template(protocol).replace("{name}", "r7"))
     (listener,) = made.listeners
-    assert (made.config.robot.name, made.device, listener.options) == ("r7", None, protocol.hq_options())
+    assert (made.config.robot.name, made.device, listener.options) == (
+        "r7",
+        None,
+        protocol.hq_options(**REQUIRED.get(name, {})),
+    )
     settings = listener.settings
     assert settings == HqSettings(protocol=name, listen=settings.listen, options=settings.options)
 
@@ -264,7 +272,7 @@ ERRORS: list[tuple[dict[str, Any], str]] = [
     ({"robot": {"name": "r1"}, "hq": hq()}, "hq = {'protocol': 'tcpudp', "),
     (serving(hq(allow=["10.0.0.0/8", 5])), "hq[0].allow[1] = 5: expected `str`"),
     # One of several
-    (serving(hq(protocol="nope")), "hq[0].protocol = 'nope': expected one of alf, ros2, tcpudp, wc2ec"),
+    (serving(hq(protocol="nope")), "hq[0].protocol = 'nope': expected one of alf, mavlink, ros2, tcpudp, wc2ec"),
     (minimal(bus={"mode": "mesh"}), "bus.mode = 'mesh': expected one of 'client', 'peer', 'router'"),
     (device(options={"force": ["wings"]}), "device.options.force[0] = 'wings': expected one of"),
     (device(options={"force": [300]}), "device.options.force[0] = 300: expected `int` <= 255"),
@@ -349,6 +357,7 @@ ERRORS: list[tuple[dict[str, Any], str]] = [
     (device(options={"map_origin": [0.0, NAN]}), "device.options.map_origin[1] = nan: expected `float` "),
     # Options that a protocol checks by itself
     (serving(hq(options={"versions": ["one"]})), "hq[0].options.versions[0] = 'one': "),
+    (serving(hq(protocol="mavlink")), "hq[0].options.system_id: missing, it is required"),
     (serving(hq(protocol="wc2ec", options={"dialect": "draft"})), "devices: must be listed for the draft"),
 ]
 

@@ -72,6 +72,7 @@ ADDRESSES = {
     "tcpudp": ["serial:///dev/ttyUSB0?baud=57600"],
     "wc2ec": ["tcp://[fd00::7]:27015"],
     "ros2": ["tcp://ros.lab:7448"],
+    "mavlink": ["serial:///dev/ttyACM0?baud=115200"],
 }
 
 
@@ -151,7 +152,7 @@ WRONG: list[tuple[str, int, str]] = [
     ("drive a%b", 2, f"ROBOT = 'a%b': {NAMES}\n"),
     ("health a%b", 2, f"ROBOT = 'a%b': {NAMES}\n"),
     ("init tcpudp --name a%b", 2, f"--name = 'a%b': {NAMES}\n"),
-    ("init nothing", 2, "protocol = 'nothing': expected one of alf, ros2, tcpudp, wc2ec\n"),
+    ("init nothing", 2, "protocol = 'nothing': expected one of alf, mavlink, ros2, tcpudp, wc2ec\n"),
     ("ls --realm a/b", 2, f"--realm = 'a/b': {NAMES}\n"),
     ("echo /fleet/r1/pose", 2, "try 'fleet/r1/pose'\n"),
     ("echo fleet//pose", 2, "empty chunks are forbidden"),

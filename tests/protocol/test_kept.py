@@ -22,11 +22,15 @@ from zbridge.protocol.traffic import Datagram
 SETTINGS = bytes.fromhex("210000000102020b000000312e312c312e322c312e3300010101010101e803000064000000")
 """serverSettings of a robot of 1.3 without UDP, from the protocol page."""
 POSITION = bytes.fromhex("0e0000000137") + bytes(12)
+HEARTBEAT = bytes.fromhex("fd0900000001010000000f0000000a03c10403ac7c")
+"""Of an armed rover in GUIDED, from the protocol page."""
 STREAMS = {
     "tcpudp": SETTINGS + POSITION + POSITION,
     "alf": b"2|-95|95|0.25|100|20|5600;4|0|1|2|3|4|5|6|7;4|0|1|2|3|4|5|6|7;",
     "wc2ec": b"".join(bytes([0, 53, number, 5]) + b"motor" for number in (8, 9)),
+    "mavlink": HEARTBEAT + HEARTBEAT + HEARTBEAT,
 }
+HQ_OPTIONS = {"mavlink": {"system_id": 1}}
 
 
 def carried(state: Any) -> Any:
@@ -93,7 +97,7 @@ def test_a_frame_keeps_its_kind() -> None:
 def test_a_listeners_client_goes_on_in_another_process(name: str) -> None:
     protocol = find_protocol(name)
     assert protocol.hq is not None
-    sides = [protocol.hq(protocol.hq_options(), RobotView(), Metrics()) for _ in range(2)]
+    sides = [protocol.hq(protocol.hq_options(**HQ_OPTIONS.get(name, {})), RobotView(), Metrics()) for _ in range(2)]
     before, after = (side.session(3, Limits(65_536, 5.0)) for side in sides)
     before.open(1.0)
     sides[1].restore(carried(sides[0].export()))

@@ -9,6 +9,7 @@ import asyncio
 import logging
 import math
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any
 
 from zbridge.errors import EncodeError, ProtocolError, Refused
@@ -95,22 +96,18 @@ class Client:
             self._context.failures.note("cannot send to a client", error)
         self.conversation.pump()
 
-    def tell(self, text: str, *, again: bool = False) -> None:
-        """Tell the people at the client a text, the same one at most once in TELL_S unless ``again`` is set."""
+    def tell(self, text: str, *, again: bool = False, drives: bool = True) -> None:
+        """Tell the people at the client a text, the same one at most once in TELL_S unless ``again`` is set.
+
+        drives: False if the text says why the client does not drive; its program is shown that each time.
+        """
         now = self._context.clock()
         if again:
             self._told.pop(text, None)
         if self.begun and now - self._told.get(text, -TELL_S) >= TELL_S:
             self._told = {old: at for old, at in self._told.items() if now - at < TELL_S} | {text: now}
             self.send(lambda session, now: self._context.side.tell(session, text, now))
-
-    def _stop_driving(self, why: str) -> None:
-        """Tell the people at the client why it does not drive, and show its program that it does not."""
-        self.tell(why)
-        self._show_not_driving()
-
-    def _show_not_driving(self) -> None:
-        if self.begun:
+        if self.begun and not drives:
             self.send(self._context.side.not_driving)
 
     def tick(self) -> None:
@@ -131,7 +128,7 @@ class Client:
     def let_go(self, why: str) -> None:
         """Give the robot back; the program must send neutral before it drives again."""
         if self.operator.intent.held:
-            self._show_not_driving()
+            self.send(self._context.side.not_driving)
         self.operator.let_go(why)
 
     # A restart
@@ -249,10 +246,7 @@ class Client:
         context = self._context
         self.session.traffic.refused += 1
         context.counts.refused.value += 1
-        if topic is topics.CMD_DRIVE:
-            self._stop_driving(str(refusal))
-        else:
-            self.tell(str(refusal))
+        self.tell(str(refusal), drives=topic is not topics.CMD_DRIVE)
         if context.robot.view.alive:
             self._refusals.note(self.operator.who, topic.path.partition("/")[2], refusal)
 
@@ -293,7 +287,7 @@ class Client:
             who=f"hq.{self._context.name}.{self.number}",
             protocol=side.name,
             is_motion=side.is_motion,
-            tell=self._stop_driving,
+            tell=partial(self.tell, drives=False),
             clock=self._context.clock,
             clock_ms=self._context.clock_ms,
         )

@@ -16,7 +16,7 @@ from gateways.mavlink.station.driving import RELEASE, VELOCITY_ONLY
 from gateways.mavlink.station.options import MavlinkHqOptions
 from gateways.mavlink.station.parameters import Parameters
 from gateways.mavlink.station.session import Station
-from gateways.mavlink.station.vehicle import Vehicle
+from gateways.mavlink.station.vehicle import ShownRover
 from zbridge.fleet.messages import Control, FleetMessage, Text
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
@@ -40,7 +40,7 @@ class MavlinkHq(HqSide):
     def __init__(self, options: MavlinkHqOptions, view: RobotView, metrics: Metrics | None = None) -> None:
         self.options = options
         self.view = view
-        self.vehicle = Vehicle(options, view)
+        self.vehicle = ShownRover(options, view)
         self.parameters = Parameters(options, DEADMAN_S)
         self._stopped: str | None = None
         """The state of ``control`` as it was shown last."""

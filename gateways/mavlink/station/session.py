@@ -18,7 +18,7 @@ from gateways.mavlink.session import MavlinkSession
 from gateways.mavlink.station.options import MavlinkHqOptions
 from gateways.mavlink.station.parameters import Parameters
 from gateways.mavlink.station.streams import TIMED, Streams
-from gateways.mavlink.station.vehicle import Vehicle
+from gateways.mavlink.station.vehicle import ShownRover
 from gateways.mavlink.texts import chunks_of, clip
 from zbridge.fleet.messages import Drive
 from zbridge.protocol import Limits, Refused, Role
@@ -33,7 +33,7 @@ _MAVLINK = 3
 _MOST_TEXT_ID = 65535
 
 
-class Stick(msgspec.Struct):
+class SaidMotion(msgspec.Struct):
     """What sticks and setpoints have said. axes: throttle and steering to the right, thousandths."""
 
     axes: tuple[int, int] = (0, 0)
@@ -55,11 +55,11 @@ class Station(MavlinkSession[MavlinkFrame]):
     role = Role.ROBOT
     kept: ClassVar[dict[str, Any]] = {"mode": int, "armed": bool, "there": bool, "streams": Streams, "_texts": int}
 
-    def __init__(self, options: MavlinkHqOptions, vehicle: Vehicle, parameters: Parameters, bounds: Limits) -> None:
+    def __init__(self, options: MavlinkHqOptions, vehicle: ShownRover, parameters: Parameters, bounds: Limits) -> None:
         super().__init__(options.system_id, AUTOPILOT, bounds)
         self.vehicle, self.parameters = vehicle, parameters
         self.options = options
-        self.stick = Stick()
+        self.stick = SaidMotion()
         self.mode: int = RoverMode.HOLD
         self.armed = False
         self.there = False

@@ -37,7 +37,7 @@ FIRMWARE = 4 << 24 | 5 << 16 | 255
 """ArduRover 4.5, official: what its programs expect of a rover holds for it."""
 
 
-class Vehicle:
+class ShownRover:
     """The robot of one listener as a rover."""
 
     def __init__(self, options: MavlinkHqOptions, view: RobotView) -> None:
@@ -47,7 +47,7 @@ class Vehicle:
         self._begun_ns: int | None = None
 
     def __repr__(self) -> str:
-        return f"<Vehicle {self.options.system_id} {self.view!r}>"
+        return f"<ShownRover {self.options.system_id} {self.view!r}>"
 
     def note(self, message: FleetMessage) -> tuple[int, ...]:
         """Keep what the view does not; return the ids of the messages that tell something new now."""
@@ -233,18 +233,18 @@ def _bounded(value: float, most: float) -> float:
     return max(-most, min(most, _finite(value)))
 
 
-_MAKERS: dict[int, Callable[[Vehicle], MavlinkMessage | None]] = {
-    telemetry.SysStatus.spec.id: Vehicle._status,
-    telemetry.GpsRawInt.spec.id: Vehicle._gps,
-    telemetry.Attitude.spec.id: Vehicle._attitude,
-    telemetry.LocalPositionNed.spec.id: Vehicle._local,
-    telemetry.GlobalPositionInt.spec.id: Vehicle._global,
-    telemetry.VfrHud.spec.id: Vehicle._hud,
-    telemetry.BatteryStatus.spec.id: Vehicle._battery_status,
-    telemetry.HomePosition.spec.id: Vehicle._home,
-    telemetry.ExtendedSysState.spec.id: Vehicle._landed,
-    telemetry.ObstacleDistance.spec.id: Vehicle._obstacles,
-    control.AutopilotVersion.spec.id: Vehicle._version,
+_MAKERS: dict[int, Callable[[ShownRover], MavlinkMessage | None]] = {
+    telemetry.SysStatus.spec.id: ShownRover._status,
+    telemetry.GpsRawInt.spec.id: ShownRover._gps,
+    telemetry.Attitude.spec.id: ShownRover._attitude,
+    telemetry.LocalPositionNed.spec.id: ShownRover._local,
+    telemetry.GlobalPositionInt.spec.id: ShownRover._global,
+    telemetry.VfrHud.spec.id: ShownRover._hud,
+    telemetry.BatteryStatus.spec.id: ShownRover._battery_status,
+    telemetry.HomePosition.spec.id: ShownRover._home,
+    telemetry.ExtendedSysState.spec.id: ShownRover._landed,
+    telemetry.ObstacleDistance.spec.id: ShownRover._obstacles,
+    control.AutopilotVersion.spec.id: ShownRover._version,
 }
 _OF_POSE = (telemetry.Attitude, telemetry.LocalPositionNed, telemetry.GlobalPositionInt, telemetry.VfrHud)
 _NEWS: dict[type[FleetMessage], tuple[int, ...]] = {

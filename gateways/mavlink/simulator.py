@@ -76,7 +76,6 @@ class ArduRover(SimulatedRobot):
         self.mode, self.armed = RoverMode.HOLD, False
         self.stick = (0.0, 0.0)
         self.arming_fault: str | None = None
-        self.uid = 0x1234
         self.received: list[MavlinkFrame] = []
         """All that was sent to it."""
         self._frames = FrameBuffer(frame_end, LIMIT_BYTES)
@@ -338,7 +337,7 @@ class ArduRover(SimulatedRobot):
         return telemetry.BatteryStatus(voltages=cells, current_battery=150, battery_remaining=self._percent())
 
     def _version(self) -> MavlinkMessage:
-        return control.AutopilotVersion(uid=self.uid, flight_sw_version=4 << 24 | 5 << 16 | 1 << 8 | 255)
+        return control.AutopilotVersion(uid=0x1234, flight_sw_version=4 << 24 | 5 << 16 | 1 << 8 | 255)
 
     def _home(self) -> MavlinkMessage:
         return telemetry.HomePosition(HOME_LAT, HOME_LON, 488000)

@@ -46,7 +46,7 @@ def simulate(protocol: Protocol, options: SimulateOptions) -> None:
         run_plugin_hq(protocol, options)
     else:
         with prefixed("--hq ", LinkError):
-            address = Address.parse(options.hq)
+            address = protocol.port(options.hq)
         drive = read_drive(options.drive)
         simulate_hq(protocol, HqSimulation(address, options.version, options.dialect, options.udp, drive))
 
@@ -79,7 +79,7 @@ def simulation_of(protocol: Protocol, options: SimulateOptions) -> Simulation:
     """Make the start options of a simulated robot; raise LinkError, ConfigError for a faulty address."""
     listen = [] if options.serial else options.listen or default_addresses(protocol)
     with prefixed("--listen ", LinkError):
-        addresses = tuple(map(Address.parse, listen))
+        addresses = tuple(map(protocol.port, listen))
     return Simulation(
         addresses,
         options.seed,
@@ -93,7 +93,7 @@ def simulation_of(protocol: Protocol, options: SimulateOptions) -> Simulation:
 
 def default_addresses(protocol: Protocol) -> list[str]:
     """Return where the protocol's template expects a robot; raise ConfigError if it names no address of that kind."""
-    addresses = _template_addresses(protocol, "tcp://")
+    addresses = _template_addresses(protocol, "tcp://") or _template_addresses(protocol, "udp://")
     if not addresses:
         raise ConfigError(f"listen: missing, the template of {protocol.name} names no address tcp://host:port")
     return addresses

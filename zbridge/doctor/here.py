@@ -20,10 +20,10 @@ from zbridge.doctor.findings import Finding, Layer, error, note, ok, warning
 from zbridge.doctor.robot import judge_disks
 from zbridge.fleet.processes import DiskSpace
 from zbridge.host.addresses import forms_of, holders, rival
-from zbridge.protocol.address import Address
+from zbridge.protocol.address import Address, DatagramAddress
 
-_LISTENING = "0A"
-"""The state LISTEN in ``/proc/net/tcp``."""
+_LISTENING = {"tcp": "0A", "udp": "07"}
+"""The state of a listening socket in ``/proc/net/tcp`` (LISTEN) and ``udp`` (unconnected)."""
 _RESOLVE_S = 2.0
 _UNIT_S = 2.0
 _UNITS = ("zbridge.service", "zbridge@{robot}.service")
@@ -85,8 +85,9 @@ def examine_address(plan: GatewayPlan) -> Iterator[Finding]:
 
 def examine_ports(plan: GatewayPlan, *, runs: bool) -> Iterator[Finding]:
     """Read from the kernel's table whether somebody listens for HQ programs. runs: whether the gateway should."""
-    ports = listening_ports()
+    tables = [listening_ports(kind) for kind in _LISTENING]
     for number, listener in enumerate(plan.listeners):
+        ports = tables[isinstance(listener.address, DatagramAddress)]
         address, named = listener.address, f"hq[{number}].listen = {plan.config.hq[number].listen!r}"
         if ports is None or not address.port:
             yield note(Layer.LISTENERS, "unknown_port", f"{named}: which ports are open cannot be read here")
@@ -95,7 +96,7 @@ def examine_ports(plan: GatewayPlan, *, runs: bool) -> Iterator[Finding]:
                 Layer.LISTENERS,
                 "port_taken",
                 f"{named}: another program has port {address.port}: the gateway does not start",
-                "choose another port, or end the other program (ss -ltnp shows it)",
+                "choose another port, or end the other program (ss -ltunp shows it)",
             )
         elif address.port not in ports and runs:
             yield error(
@@ -109,15 +110,15 @@ def examine_ports(plan: GatewayPlan, *, runs: bool) -> Iterator[Finding]:
             yield ok(Layer.LISTENERS, f"{named}: open at {bound}")
 
 
-def listening_ports() -> dict[int, set[str]] | None:
+def listening_ports(kind: str = "tcp") -> dict[int, set[str]] | None:
     """Return the ports at which processes of this machine listen, with their addresses; None if that is not known."""
     found: dict[int, set[str]] = {}
     read = False
-    for table, family in (("/proc/net/tcp", socket.AF_INET), ("/proc/net/tcp6", socket.AF_INET6)):
+    for table, family in ((f"/proc/net/{kind}", socket.AF_INET), (f"/proc/net/{kind}6", socket.AF_INET6)):
         with suppress(OSError, ValueError):
             for line in Path(table).read_text().splitlines()[1:]:
                 _, local, _, state, *_ = line.split()
-                if state == _LISTENING:
+                if state == _LISTENING[kind]:
                     host, _, port = local.rpartition(":")
                     found.setdefault(int(port, 16), set()).add(_written(host, family))
             read = True

@@ -30,7 +30,7 @@ import msgspec
 
 from zbridge.app.config import GatewayPlan
 from zbridge.errors import ConfigError
-from zbridge.protocol.address import Address, DeviceAddress, SerialAddress, ZenohAddress
+from zbridge.protocol.address import Address, DatagramAddress, DeviceAddress, SerialAddress, ZenohAddress
 from zbridge.robot.settings import DevicePlan
 
 RESOLVE_S = 2.0
@@ -76,6 +76,9 @@ def _lockable_forms(address: DeviceAddress, ips: Mapping[str, frozenset[str]]) -
             return frozenset()
         case Address(port=0):  # any port
             return frozenset()
+        case DatagramAddress():
+            kind = "udp-in" if address.waits else "udp"
+            return frozenset(f"{kind} {ip} {address.port}" for ip in ips[address.host])
         case Address():
             return frozenset(f"tcp {ip} {address.port}" for ip in ips[address.host])
     assert_never(address)

@@ -78,6 +78,8 @@ class Duplicate(msgspec.Struct):
             return False
         try:
             if not datagram:
+                with contextlib.suppress(ConnectionRefusedError):  # of an earlier datagram: this one was not sent
+                    return os.write(self.descriptors[0], data) == len(data)
                 return os.write(self.descriptors[0], data) == len(data)
             with _borrowed(self.descriptors[0]) as robot, _borrowed(self.descriptors[1]) as own:
                 # To where the stream leads: a robot takes datagrams at the same address and port.

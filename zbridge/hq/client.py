@@ -166,7 +166,7 @@ class Client:
 
     def sweep(self) -> None:
         """End a client that is stalled, is silent for too long, or sends only malformed messages."""
-        traffic, idle_s = self.session.traffic, self._context.settings.idle_s
+        traffic, idle_s, link = self.session.traffic, self._context.settings.idle_s, self.conversation.link
         self._stalled_s = max(0.0, self._stalled_s + (SWEEP_S if self.conversation.stalled else -SWEEP_S))
         self._silent_s = self._silent_s + SWEEP_S if traffic.bytes_in == self._bytes_in else 0.0
         self._bytes_in = traffic.bytes_in
@@ -176,7 +176,7 @@ class Client:
             self.conversation.close("only malformed messages")
         elif self._stalled_s >= STALL_S:
             self.conversation.cut(f"read nothing for {STALL_S:g} s")
-        elif idle_s is not None and self._silent_s >= idle_s:
+        elif idle_s is not None and self._silent_s >= idle_s and (link is None or not link.lasting):
             self.conversation.close(f"silent for {idle_s:g} s")
 
     def close(self) -> None:

@@ -31,7 +31,7 @@ from zbridge.protocol.plugin import ATTEND_S
 from zbridge.protocol.session import Limits, Session
 from zbridge.protocol.session_table import SessionTable
 from zbridge.tasks import Tasks
-from zbridge.transport import Accepted, Conversation, Door, Link, Parcel, Receiver, TlsLink, listen
+from zbridge.transport import Accepted, Conversation, Link, Parcel, Receiver, TlsLink, listen, make_door
 from zbridge.transport.kernel import KERNEL, Kernel
 
 log = Log("zbridge.hq")
@@ -82,7 +82,8 @@ class Listener:
         if (tls := plan.tls) is not None:
             self._secured = lambda receiver: TlsLink(receiver, tls, plan.settings.handshake_s)
         self._closing = False
-        self._door = Door(exported[0]["door"], exported[1], kernel) if exported is not None else Door(kernel=kernel)
+        door = (exported[0]["door"], exported[1]) if exported is not None else None
+        self._door = make_door(plan.address, door, kernel, plan.to)
         self.handover = ListenerHandover(context, self._door, self.clients, self._numbers, self._add)
         """How the listener is handed to another process."""
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 
-from zbridge.protocol.address import Address
+from zbridge.protocol.address import Address, DatagramAddress
 from zbridge.protocol.networks import Network
 from zbridge.protocol.plugin import Protocol
 
@@ -31,7 +31,10 @@ class ListenerTls(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class HqSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One ``[[hq]]``: where HQ programs of one protocol connect as if this were the robot, and their limits.
 
-    protocol: the protocol of the HQ programs. listen: ``tcp://host:port`` or ``tls://host:port``. name: of the listener
+    protocol: the protocol of the HQ programs. listen: ``tcp://host:port`` or ``tls://host:port``; if the protocol
+    allows datagrams alone (MAVLink) also ``udp://host:port``: a client is then an address and port that sends, and gone
+    after 5 s without a datagram. to: with ``udp://`` only, addresses ``udp://host:port`` that are clients from the
+    beginning, although nothing came from them: for programs that wait until the robot speaks. name: of the listener
     on the bus; absent: made of the protocol and the process. clients: most at a time. accept_hz: connections a second
     that are accepted from one address. handshake_s: longest time for a client's handshake. idle_s: longest silence of a
     client; absent: no limit. rate_hz: messages a second of one client. allow: networks that clients may connect from;
@@ -40,6 +43,7 @@ class HqSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     protocol: str
     listen: str
+    to: tuple[str, ...] = ()
     name: Annotated[str, msgspec.Meta(max_length=40)] | None = None
     options: dict[str, Any] = {}
     clients: Annotated[int, msgspec.Meta(ge=1, le=10_000)] = 256
@@ -54,7 +58,7 @@ class HqSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class ListenerPlan(msgspec.Struct, frozen=True):
     """What one listener is made of: its protocol, that protocol's options, where it listens, and for whom.
 
-    tls: of a listener at ``tls://``, else None.
+    tls: of a listener at ``tls://``, else None. to: clients unasked, of a listener at ``udp://``.
     """
 
     protocol: Protocol
@@ -63,3 +67,4 @@ class ListenerPlan(msgspec.Struct, frozen=True):
     settings: HqSettings
     allow: tuple[Network, ...]
     tls: SSLContext | None = None
+    to: tuple[DatagramAddress, ...] = ()

@@ -1,7 +1,7 @@
 """Where a peer of a legacy protocol is, as configurations and logs write it. Opens nothing.
 
 A robot is at a :data:`DeviceAddress`: a TCP port, a serial line, or a Zenoh router of its own. Listeners and simulators
-are at TCP ports only.
+are at TCP ports. Where the protocol allows it (``Protocol.datagrams``), all of them may be at UDP ports.
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ import msgspec
 from zbridge.errors import LinkError
 
 _TCP = "tcp://host:port"
+_UDP = "udp://host:port"
+_UDP_IN = "udp-in://host:port"
 _TLS = "tls://"
 _SERIAL = "serial:///path?baud=N"
 
@@ -30,13 +32,16 @@ class Address(msgspec.Struct, frozen=True):
         parts = _split(text, _TCP)
         if parts.scheme == "serial":
             raise LinkError(f"{text!r}: expected {_TCP}; only a robot is connected by a serial line")
-        return _tcp(text, parts, _TCP)
+        return _port(text, parts, _TCP, ("tcp",))
 
     @classmethod
-    def parse_listener(cls, text: str) -> Address:
-        """Read ``tcp://host:port`` or ``tls://host:port``; raise LinkError that names what was expected."""
+    def parse_listener(cls, text: str, *, datagrams: bool = False) -> Address:
+        """Read ``tcp://host:port`` or ``tls://host:port``; raise LinkError that names what was expected.
+
+        datagrams: or ``udp://host:port``, a :class:`DatagramAddress`.
+        """
         if not text.startswith(_TLS):
-            return cls.parse(text)
+            return parse_port(text, datagrams=datagrams)
         plain = "tcp" + text[3:]
         try:
             found = cls.parse(plain)
@@ -47,6 +52,18 @@ class Address(msgspec.Struct, frozen=True):
     def __str__(self) -> str:
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{'tls' if self.tls else 'tcp'}://{host}:{self.port}"
+
+
+class DatagramAddress(Address, frozen=True):
+    """A UDP port, for datagrams alone: ``udp://host:port``. waits: for the peer to speak first: ``udp-in://host:port``.
+
+    The port is the peer's, or our own where we wait.
+    """
+
+    waits: bool = False
+
+    def __str__(self) -> str:
+        return ("udp-in" if self.waits else "udp") + super().__str__()[3:]
 
 
 class SerialAddress(msgspec.Struct, frozen=True):
@@ -78,11 +95,30 @@ DeviceAddress = Address | SerialAddress | ZenohAddress
 """Where a robot is."""
 
 
-def parse_device_address(text: str) -> DeviceAddress:
-    """Read ``tcp://host:port`` or ``serial:///path?baud=N``; raise LinkError that names what was expected."""
-    expected = f"{_TCP} or {_SERIAL}"
+def parse_device_address(text: str, *, datagrams: bool = False) -> DeviceAddress:
+    """Read ``tcp://host:port`` or ``serial:///path?baud=N``; raise LinkError that names what was expected.
+
+    datagrams: or ``udp://host:port``, or ``udp-in://host:port``.
+    """
+    expected = f"{_TCP}, {_UDP}, {_UDP_IN} or {_SERIAL}" if datagrams else f"{_TCP} or {_SERIAL}"
     parts = _split(text, expected)
-    return _serial(text, parts) if parts.scheme == "serial" else _tcp(text, parts, expected)
+    schemes = ("tcp", "udp", "udp-in") if datagrams else ("tcp",)
+    return _serial(text, parts) if parts.scheme == "serial" else _port(text, parts, expected, schemes)
+
+
+def parse_port(text: str, *, datagrams: bool = False) -> Address:
+    """Read ``tcp://host:port``, and with ``datagrams`` also ``udp://host:port``; raise LinkError."""
+    if not datagrams:
+        return Address.parse(text)
+    expected = f"{_TCP} or {_UDP}"
+    return _port(text, _split(text, expected), expected, ("tcp", "udp"))
+
+
+def parse_datagram_address(text: str) -> DatagramAddress:
+    """Read ``udp://host:port``; raise LinkError."""
+    found = _port(text, _split(text, _UDP), _UDP, ("udp",))
+    assert isinstance(found, DatagramAddress)
+    return found
 
 
 def _split(text: str, expected: str) -> SplitResult:
@@ -92,16 +128,16 @@ def _split(text: str, expected: str) -> SplitResult:
         raise LinkError(f"{text!r}: {error}; expected {expected}") from error
 
 
-def _tcp(text: str, parts: SplitResult, expected: str) -> Address:
+def _port(text: str, parts: SplitResult, expected: str, schemes: tuple[str, ...]) -> Address:
     try:
         host, port = parts.hostname, parts.port
         (host or "").encode("idna")
     except ValueError as error:
         raise LinkError(f"{text!r}: {error}; expected {expected}") from error
     odd = parts.path or parts.query or parts.fragment or parts.username is not None
-    if parts.scheme != "tcp" or not host or port is None or odd:
+    if parts.scheme not in schemes or not host or port is None or odd:
         raise LinkError(f"{text!r}: expected {expected}")
-    return Address(host, port)
+    return Address(host, port) if parts.scheme == "tcp" else DatagramAddress(host, port, waits=parts.scheme == "udp-in")
 
 
 def _serial(text: str, parts: SplitResult) -> SerialAddress:

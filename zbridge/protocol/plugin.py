@@ -20,7 +20,7 @@ from zbridge.fleet.messages import Drive, FleetMessage, Motor
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
 from zbridge.metrics import Metrics
-from zbridge.protocol.address import Address, DeviceAddress, ZenohAddress, parse_device_address
+from zbridge.protocol.address import Address, DeviceAddress, ZenohAddress, parse_device_address, parse_port
 from zbridge.protocol.entry_points import entry_points, find_entry_point
 from zbridge.protocol.kept import Kept
 from zbridge.protocol.session import Limits, Session, State
@@ -314,6 +314,8 @@ class Protocol(msgspec.Struct, frozen=True):
     keyed: bool = False
     """Whether its robots speak Zenoh: a link is a Zenoh session of its own, and its frames are those of
     :mod:`zbridge.protocol.samples`."""
+    datagrams: bool = False
+    """Whether its robots and HQ programs may be connected by datagrams alone: a datagram holds whole frames."""
     requires: tuple[str, ...] = ()
     """Modules that its robots need beyond what zbridge itself does; an extra installs them."""
     advice: tuple[Advice, ...] = ()
@@ -331,9 +333,13 @@ class Protocol(msgspec.Struct, frozen=True):
     def device_address(self, text: str) -> DeviceAddress:
         """Read the address of a robot of this protocol; raise LinkError that names what was expected."""
         if not self.keyed:
-            return parse_device_address(text)
+            return parse_device_address(text, datagrams=self.datagrams)
         router = Address.parse(text)
         return ZenohAddress(router.host, router.port)
+
+    def port(self, text: str) -> Address:
+        """Read where a listener or a simulated robot of this protocol is; raise LinkError."""
+        return parse_port(text, datagrams=self.datagrams)
 
 
 def protocol_names() -> tuple[str, ...]:

@@ -36,7 +36,7 @@ from zbridge.protocol.session_states import State as State
 from zbridge.protocol.traffic import Datagram as Datagram
 from zbridge.protocol.traffic import Limits as Limits
 from zbridge.protocol.traffic import Traffic as Traffic
-from zbridge.wire.frames import FrameBuffer, FrameEnd, Partial
+from zbridge.wire.frames import DatagramFrames, FrameBuffer, FrameEnd, Partial
 
 M = TypeVar("M")
 
@@ -156,6 +156,11 @@ class Session(Kept, ABC, Generic[M]):
     def open(self, now: float) -> None:
         """Begin: the transport is up. A session that has ended stays so."""
         self._on(SessionEvent.OPEN, now=now)
+
+    def by_datagrams(self) -> None:
+        """Take the bytes of each :meth:`receive` as one datagram of whole frames: the link has no stream."""
+        self.transport = "udp"
+        self._frames = DatagramFrames(self.frame_end, self.limits.frame_bytes, self.malformed)
 
     def receive(self, data: bytes, now: float) -> list[M]:
         """Receive bytes, cut anywhere; return the messages for the translator, also those before a broken frame."""
@@ -334,11 +339,7 @@ class Session(Kept, ABC, Generic[M]):
     # A restart of the gateway
 
     def export(self, budget: Budget | None = None) -> Exported:
-        """Write the state, with the incomplete frame.
-
-        A deposit has no incomplete frame: it changes with every read, and who watches the reads adds it
-        (:meth:`partial`).
-        """
+        """Write the state with the incomplete frame; to a deposit, who watches reads adds that (:meth:`partial`)."""
         state = super().export(budget) | ({"silence": self.silence.export()} if self._watches else {})
         return state | {PARTIAL: list(self._frames.partial() or ())} if budget is None else state
 

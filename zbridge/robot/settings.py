@@ -16,8 +16,9 @@ class DeviceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[device]``: the robot itself.
 
     protocol: the robot's protocol. connect: one address for each of its links, ``tcp://host:port`` or
-    ``serial:///dev/ttyUSB0?baud=57600``. allow_shared_address: gateways of other robot names may connect to the same
-    address; both must say so.
+    ``serial:///dev/ttyUSB0?baud=57600``; if the protocol allows datagrams alone (MAVLink) also ``udp://host:port`` (the
+    gateway speaks first) or ``udp-in://host:port`` (our own port: the first that sends to it is the robot).
+    allow_shared_address: gateways of other robot names may connect to the same address; both must say so.
     """
 
     protocol: str

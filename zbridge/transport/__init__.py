@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from zbridge.transport.accepted import Accepted, ClientConversation
-from zbridge.transport.by_address import attach, connect
+from zbridge.transport.by_address import attach, connect, listen, make_door
 from zbridge.transport.conversation import Conversation, ConversationHooks
 from zbridge.transport.door import Door
 from zbridge.transport.link import Link, Receiver
-from zbridge.transport.tcp import TcpLink, listen
+from zbridge.transport.tcp import TcpLink
 from zbridge.transport.tls import TlsLink, server_context
 from zbridge.transport.transferable import Parcel, Transferable
 
@@ -26,5 +26,6 @@ __all__ = [
     "attach",
     "connect",
     "listen",
+    "make_door",
     "server_context",
 ]

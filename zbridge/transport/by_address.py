@@ -1,11 +1,16 @@
-"""Connects to a robot, whatever kind of link leads to it."""
+"""Connects to a robot, and listens for peers, whatever kind of link leads to them."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import AbstractAsyncContextManager
+
 from zbridge.errors import ProtocolError
-from zbridge.protocol.address import DeviceAddress, SerialAddress, ZenohAddress
+from zbridge.metrics import Count
+from zbridge.protocol.address import Address, DatagramAddress, DeviceAddress, SerialAddress, ZenohAddress
 from zbridge.protocol.kept import Exported
-from zbridge.transport import serial, tcp
+from zbridge.transport import datagram_link, serial, sources, tcp
+from zbridge.transport.door import Door
 from zbridge.transport.kernel import KERNEL, Kernel
 from zbridge.transport.link import Link, Receiver
 from zbridge.transport.transferable import Parcel
@@ -25,6 +30,8 @@ async def connect(
         from zbridge.transport import zenoh_link  # loads what only these links need
 
         return await zenoh_link.connect(address, receiver)
+    if isinstance(address, DatagramAddress):
+        return await datagram_link.connect(address, receiver, kernel)
     return await tcp.connect(address, receiver, buffer, kernel)
 
 
@@ -39,4 +46,38 @@ async def attach(
         return serial.attach(address, parcel.take(state.get("serial")), receiver)
     if isinstance(address, ZenohAddress):
         raise ProtocolError("a Zenoh session stays in its process")
+    if isinstance(address, DatagramAddress):
+        return datagram_link.attach(state, parcel, receiver, kernel)
     return await tcp.attach(state, parcel, receiver, kernel)
+
+
+def listen(
+    address: Address,
+    receiver: Callable[[], Receiver],
+    *,
+    datagrams: bool = False,
+    foreign: Count | None = None,
+    secured: Callable[[Receiver], Receiver] | None = None,
+    door: Door | None = None,
+) -> AbstractAsyncContextManager[Address]:
+    """Accept peers as :func:`zbridge.transport.tcp.listen` does; at a UDP port by :func:`zbridge.transport.sources`.
+
+    door: of a UDP port a :class:`~zbridge.transport.sources.SourceDoor`.
+    """
+    if not isinstance(address, DatagramAddress):
+        return tcp.listen(address, receiver, datagrams=datagrams, foreign=foreign, secured=secured, door=door)
+    made = door if isinstance(door, sources.SourceDoor) else sources.SourceDoor()
+    return sources.listen(address, receiver, foreign or Count(), made)
+
+
+def make_door(
+    address: Address,
+    exported: tuple[Exported, Parcel] | None,
+    kernel: Kernel = KERNEL,
+    to: tuple[DatagramAddress, ...] = (),
+) -> Door:
+    """Make the door of a listener. exported: as another process exported it. to: see :class:`SourceDoor`."""
+    state, parcel = exported if exported is not None else (None, None)
+    if isinstance(address, DatagramAddress):
+        return sources.SourceDoor(state, parcel, kernel, to)
+    return Door(state, parcel, kernel)

@@ -134,6 +134,8 @@ class Conversation(Receiver):
         self._hooks.linked(link, True)
         if self.reading.suspended:
             link.suspend()
+        if link.datagrams_only:
+            self.session.by_datagrams()
         self.session.peer = link.peer
         self.session.open(self._clock())
 
@@ -166,6 +168,9 @@ class Conversation(Receiver):
     def foreign_datagram(self) -> None:
         self.session.traffic.foreign += 1
         self._hooks.foreign.value += 1
+
+    def unsent(self) -> None:
+        self.session.traffic.dropped += 1
 
     def _hand_on(self, messages: list[Any]) -> None:
         if self.session.state is not self._seen[0] and not self.session.over:

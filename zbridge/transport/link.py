@@ -1,7 +1,8 @@
 """A link (one transport connection to a peer) and its receiver, as each kind of them begins. Opens nothing itself.
 
 Links are :class:`~zbridge.transport.tcp.TcpLink`, its form with TLS, :class:`~zbridge.transport.serial.SerialLink`,
-:class:`~zbridge.transport.zenoh_link.ZenohLink`.
+:class:`~zbridge.transport.zenoh_link.ZenohLink`, and those of datagrams alone:
+:class:`~zbridge.transport.datagram_link.DatagramLink`, :class:`~zbridge.transport.sources.SourceLink`.
 """
 
 from __future__ import annotations
@@ -42,6 +43,9 @@ class Receiver:
     def foreign_datagram(self) -> None:
         """Count a datagram from elsewhere; the link has dropped it."""
 
+    def unsent(self) -> None:
+        """Count what was written on a link of datagrams, and lost at once: the kernel did not accept it."""
+
     def lost(self, reason: str) -> None:
         """End: the connection is gone. Called once, after every other method."""
 
@@ -53,6 +57,10 @@ class Link(ABC):
     """One connection to a peer. Without more it has no datagrams, tells of no delay, and stays in its process."""
 
     peer = ""
+    datagrams_only = False
+    """Whether there is no stream: each write is a datagram, and each ``received`` is one, of whole frames."""
+    lasting = False
+    """Whether the peer may be silent for as long as it likes."""
     receiver: Receiver
     """Takes what is read."""
 

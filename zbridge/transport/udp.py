@@ -14,7 +14,7 @@ from zbridge.protocol.rate_limit import RateLimit
 from zbridge.transport.kernel import KERNEL, Kernel
 from zbridge.transport.link import Link
 
-_DATAGRAM_BYTES = 65_536
+DATAGRAM_BYTES = 65_536
 _DATAGRAMS = 64
 """Most datagrams read from a socket before the loop serves others."""
 STRAYS_HZ = 20.0
@@ -27,7 +27,7 @@ _DRAINED = 1024
 """Most datagrams read before a stream is read; a socket's default buffer holds fewer."""
 
 
-class _DatagramReader:
+class DatagramReader:
     """A bound UDP socket on the event loop; asyncio and uvloop alike."""
 
     def __init__(self, kernel: Kernel) -> None:
@@ -72,7 +72,7 @@ class _DatagramReader:
             if self._socket is None or self._suspended:
                 return
             try:
-                data, source = self._socket.recvfrom(_DATAGRAM_BYTES)
+                data, source = self._socket.recvfrom(DATAGRAM_BYTES)
             except OSError:  # nothing more, or an ICMP error of an earlier send
                 return
             self._take(data, source[:2])
@@ -93,7 +93,7 @@ class _DatagramReader:
             sock.close()
 
 
-class DatagramSocket(_DatagramReader):
+class DatagramSocket(DatagramReader):
     """A UDP socket to one robot: receives from the robot's address and port, and counts everything else."""
 
     def __init__(
@@ -123,7 +123,7 @@ class DatagramSocket(_DatagramReader):
             self._link.receiver.foreign_datagram()
 
 
-class DatagramHub(_DatagramReader):
+class DatagramHub(DatagramReader):
     """The UDP socket of a listener: each source (address and port) belongs to the link of its host that claimed it.
 
     Every link of the host is asked for a datagram of an unclaimed source. If exactly one claims it and has no source

@@ -133,6 +133,28 @@ class FrameBuffer:
         return end
 
 
+class DatagramFrames(FrameBuffer):
+    """Cuts datagrams into frames: what a datagram has beside whole frames is dropped. dropped: takes the reason."""
+
+    __slots__ = ("_dropped",)
+
+    def __init__(self, frame_end: FrameEnd, limit: int, dropped: Callable[[str], object]) -> None:
+        super().__init__(frame_end, limit)
+        self._dropped = dropped
+
+    def feed(self, data: bytes) -> Iterator[bytes]:
+        """Yield every frame of a datagram; raise nothing."""
+        try:
+            yield from super().feed(data)
+            if self._rest:
+                self._dropped(f"the last {len(self._rest)} bytes of a datagram are no whole frame")
+        except ProtocolError as error:
+            self._dropped(str(error))
+        finally:
+            self._rest.clear()
+            self._needed = 0
+
+
 def _name(function: FrameEnd) -> str:
     """Return a function's name with that of its module, which is the protocol's."""
     module, name = getattr(function, "__module__", None), getattr(function, "__qualname__", None)

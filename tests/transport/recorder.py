@@ -119,7 +119,11 @@ def udp_socket(address: tuple[str, int]) -> socket.socket:
 
 async def heard_by(listening: socket.socket) -> tuple[bytes, tuple[str, int]]:
     async with asyncio.timeout(SOON_S):
-        return await asyncio.get_running_loop().sock_recvfrom(listening, 65_536)
+        while True:  # uvloop has no sock_recvfrom
+            with contextlib.suppress(BlockingIOError):
+                data, source = listening.recvfrom(65_536)
+                return data, source
+            await asyncio.sleep(0.001)
 
 
 async def until(happened: Callable[[], bool]) -> None:

@@ -56,8 +56,12 @@ class Traffic(msgspec.Struct):
     foreign: int = 0
     """Datagrams from other sources than the peer."""
     dropped: int = 0
-    """Frames dropped because the queue was full."""
+    """Frames dropped because a queue was full: the session's, or the kernel's for datagrams."""
     refused: int = 0
     """Commands of the peer that were not carried out."""
     unanswered: int = 0
     """Requests that the peer did not answer in time."""
+
+    def drop(self) -> None:
+        """Count a frame that was dropped."""
+        self.dropped += 1

@@ -136,6 +136,7 @@ class Conversation(Receiver):
             link.suspend()
         if link.datagrams_only:
             self.session.by_datagrams()
+            link.unsent = self.session.traffic.drop
         self.session.peer = link.peer
         self.session.open(self._clock())
 
@@ -168,9 +169,6 @@ class Conversation(Receiver):
     def foreign_datagram(self) -> None:
         self.session.traffic.foreign += 1
         self._hooks.foreign.value += 1
-
-    def unsent(self) -> None:
-        self.session.traffic.dropped += 1
 
     def _hand_on(self, messages: list[Any]) -> None:
         if self.session.state is not self._seen[0] and not self.session.over:

@@ -57,7 +57,7 @@ class DatagramLink(Link):
         return self._socket is not None
 
     def write(self, data: bytes) -> None:
-        """Send ``data`` as one datagram; it is lost, and the receiver told, if the kernel does not accept it now."""
+        """Send ``data`` as one datagram; it is lost, and ``unsent`` called, if the kernel does not accept it now."""
         if self._socket is None:
             return
         try:
@@ -67,7 +67,7 @@ class DatagramLink(Link):
                 self._refused = True
                 self._socket.send(data)
         except OSError:
-            self.receiver.unsent()
+            self.unsent()
 
     write_datagram = write
 

@@ -43,9 +43,6 @@ class Receiver:
     def foreign_datagram(self) -> None:
         """Count a datagram from elsewhere; the link has dropped it."""
 
-    def unsent(self) -> None:
-        """Count what was written on a link of datagrams, and lost at once: the kernel did not accept it."""
-
     def lost(self, reason: str) -> None:
         """End: the connection is gone. Called once, after every other method."""
 
@@ -69,6 +66,8 @@ class Link(ABC):
         self.reads: Callable[[], object] = unwatched
         """Called before bytes are taken from the kernel; set by who watches the link. :meth:`Receiver.received`
         follows, with b"" where there were none."""
+        self.unsent: Callable[[], object] = unwatched
+        """Called for each datagram that is lost at once, because the kernel does not accept it."""
 
     @property
     def descriptors(self) -> tuple[int, ...]:
@@ -146,4 +145,4 @@ class Link(ABC):
 
 
 def unwatched() -> None:
-    """Do nothing: nobody watches the reads of the link."""
+    """Do nothing: nobody watches this of the link."""

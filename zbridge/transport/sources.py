@@ -64,7 +64,7 @@ class SourceLink(Link):
 
     def write(self, data: bytes) -> None:
         if self.ready and not self._hub.send(data, self.source):
-            self.receiver.unsent()
+            self.unsent()
 
     write_datagram = write
 

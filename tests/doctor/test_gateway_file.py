@@ -155,6 +155,12 @@ def test_the_kernels_table_shows_a_port_that_is_open_and_not_one_that_was_closed
     closed = here.listening_ports()
     assert closed is not None
     assert port not in closed
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as bound:
+        bound.bind(("127.0.0.1", 0))
+        port = bound.getsockname()[1]
+        assert (here.listening_ports("udp") or {})[port] == {"127.0.0.1"}
+        bound.connect(("127.0.0.1", 9))
+        assert port not in (here.listening_ports("udp") or {})
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from zbridge.app.config import GatewayPlan
 from zbridge.errors import ConfigError
 from zbridge.host import addresses
 from zbridge.host.addresses import AddressLock, hold_addresses, holders, require_free, resolve
-from zbridge.protocol.address import Address, SerialAddress, ZenohAddress, parse_device_address
+from zbridge.protocol.address import Address, DatagramAddress, SerialAddress, ZenohAddress, parse_device_address
 
 
 @pytest.fixture
@@ -44,6 +44,15 @@ def robot(name: str, port: int, host: str = "127.0.0.1", **device: Any) -> Gatew
 def forms(text: str) -> set[str]:
     address = parse_device_address(text)
     return set(resolve([address])[address])
+
+
+def test_ports_of_udp_are_the_robots_or_ours_and_none_of_tcp() -> None:
+    for address, form in (
+        (DatagramAddress("127.0.0.1", 7), {"udp 127.0.0.1 7"}),
+        (DatagramAddress("0.0.0.0", 7, waits=True), {"udp-in 127.0.0.1 7"}),
+        (DatagramAddress("127.0.0.1", 0), set[str]()),
+    ):
+        assert resolve([address])[address] == form
 
 
 def test_an_address_is_the_same_however_it_is_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

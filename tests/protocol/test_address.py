@@ -5,7 +5,14 @@ import re
 import pytest
 
 from zbridge.errors import LinkError
-from zbridge.protocol.address import Address, DeviceAddress, SerialAddress, parse_device_address
+from zbridge.protocol.address import (
+    Address,
+    DatagramAddress,
+    DeviceAddress,
+    SerialAddress,
+    parse_datagram_address,
+    parse_device_address,
+)
 
 ADDRESSES: dict[str, DeviceAddress] = {
     "tcp://127.0.0.1:11001": Address("127.0.0.1", 11001),
@@ -57,6 +64,28 @@ def test_a_listener_may_be_at_an_address_of_tls_and_a_robot_may_not() -> None:
         (Address.parse_listener, "udp://a:1", "expected tcp://host:port"),
         (Address.parse, "tls://a:1", "expected tcp://host:port"),
         (parse_device_address, "tls://a:1", "expected tcp://host:port"),
+    ):
+        with pytest.raises(LinkError, match=re.escape(repr(text)) + ".*" + re.escape(expected)):
+            parse(text)
+
+
+def test_where_the_protocol_allows_it_peers_are_at_udp_ports() -> None:
+    for text, address in {
+        "udp://robot.test:14550": DatagramAddress("robot.test", 14550),
+        "udp-in://[::]:14550": DatagramAddress("::", 14550, waits=True),
+        **ADDRESSES,
+    }.items():
+        assert parse_device_address(text, datagrams=True) == address
+        assert str(address) == text
+    assert Address.parse_listener("udp://0.0.0.0:14550", datagrams=True) == DatagramAddress("0.0.0.0", 14550)
+    assert Address.parse_listener("tcp://a:1", datagrams=True) == Address("a", 1) != DatagramAddress("a", 1)
+    assert parse_datagram_address("udp://desk:14550") == DatagramAddress("desk", 14550)
+    device = "expected tcp://host:port, udp://host:port, udp-in://host:port or serial:///path?baud=N"
+    for parse, text, expected in (
+        (lambda text: parse_device_address(text, datagrams=True), "udp://a", device),
+        (lambda text: Address.parse_listener(text, datagrams=True), "udp-in://a:1", "expected tcp://host:port or udp:"),
+        (parse_datagram_address, "tcp://a:1", "expected udp://host:port"),
+        (parse_device_address, "udp-in://a:1", "expected tcp://host:port or serial:///path?baud=N"),
     ):
         with pytest.raises(LinkError, match=re.escape(repr(text)) + ".*" + re.escape(expected)):
             parse(text)

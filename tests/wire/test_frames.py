@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zbridge.errors import ProtocolError
-from zbridge.wire.frames import FrameBuffer, FramingFault, Partial
+from zbridge.wire.frames import DatagramFrames, FrameBuffer, FramingFault, Partial
 
 LIMIT = 50
 
@@ -149,3 +149,20 @@ def test_a_frame_whose_header_does_not_tell_its_end_is_kept_whole_or_not_at_all(
 def test_what_is_no_incomplete_frame_cannot_be_resumed(partial: Partial) -> None:
     with pytest.raises(ProtocolError):
         FrameBuffer(frame_end, LIMIT).resume(partial)
+
+
+@given(st.lists(READS, max_size=20))
+def test_each_datagram_gives_its_whole_frames_whatever_came_before(datagrams: list[bytes]) -> None:
+    dropped: list[str] = []
+    frames = DatagramFrames(frame_end, LIMIT, dropped.append)
+    for datagram in datagrams:
+        expected, broken, rest = cut_at_once(datagram)
+        before = len(dropped)
+        assert list(frames.feed(datagram)) == expected
+        assert (len(dropped) - before, len(frames)) == (int(broken or rest > 0), 0)
+
+
+def test_a_datagram_that_is_left_in_the_middle_leaves_nothing() -> None:
+    frames = DatagramFrames(frame_end, LIMIT, lambda why: None)
+    assert next(frames.feed(b"\x01\x00\x02\x00\x03")) == b"\x01\x00"
+    assert list(frames.feed(b"\x04\x00")) == [b"\x04\x00"]

@@ -43,7 +43,6 @@ class HqSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     protocol: str
     listen: str
-    to: tuple[str, ...] = ()
     name: Annotated[str, msgspec.Meta(max_length=40)] | None = None
     options: dict[str, Any] = {}
     clients: Annotated[int, msgspec.Meta(ge=1, le=10_000)] = 256
@@ -53,6 +52,7 @@ class HqSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     rate_hz: Annotated[float, msgspec.Meta(ge=1, le=1e6)] = 1000.0
     allow: tuple[str, ...] = ()
     tls: ListenerTls | None = None
+    to: tuple[str, ...] = ()
 
 
 class ListenerPlan(msgspec.Struct, frozen=True):

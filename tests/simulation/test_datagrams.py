@@ -31,5 +31,5 @@ async def test_a_simulated_robot_listens_at_a_udp_port_and_is_probed_there() -> 
 
 
 def test_a_robot_of_another_protocol_is_simulated_at_tcp_ports_only() -> None:
-    with pytest.raises(ConfigError, match="--listen 'udp://127.0.0.1:0': expected tcp://host:port"):
+    with pytest.raises(ConfigError, match=r"--listen 'udp://127\.0\.0\.1:0': expected tcp://host:port"):
         simulation_of(find_protocol("alf"), SimulateOptions(listen=("udp://127.0.0.1:0",)))

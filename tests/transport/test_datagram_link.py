@@ -1,4 +1,4 @@
-"""A robot that is reached by datagrams alone: who is the peer, refusals, and the socket that goes to another process."""
+"""A robot that is reached by datagrams alone: the peer, refusals, and the socket in other hands."""
 
 from __future__ import annotations
 

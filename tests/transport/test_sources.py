@@ -75,7 +75,8 @@ async def test_each_source_is_a_client_with_a_link_of_its_own(served: Served) ->
     await until(lambda: len(served.came) == 2 and len(served.came[0].data) == 8)
     first, second = served.came
     assert (first.data, second.data, first.calls) == (b"one more", b"two", ["attached", "received", "received"])
-    assert first.link is not None and second.link is not None
+    assert first.link is not None
+    assert second.link is not None
     assert (first.link.peer, first.link.ready) == (f"udp://127.0.0.1:{one.getsockname()[1]}", True)
     second.link.write(b"answer")
     second.link.write(b"again")
@@ -99,7 +100,8 @@ async def test_a_client_is_gone_after_silence_and_comes_back_with_its_next_datag
         await asyncio.sleep(0.02)
     first, second = served.came
     assert (first.reason, second.reason) == ("silent for 0.1 s", None)
-    assert first.link is not None and not first.link.ready
+    assert first.link is not None
+    assert not first.link.ready
     first.link.write(b"nobody")
     quiet.send(b"back")
     await until(lambda: len(served.came) == 3 and served.came[2].data == b"back")
@@ -183,7 +185,8 @@ async def test_the_socket_goes_to_another_process_with_all_clients(served: Serve
     one.send(b"one")
     await until(lambda: len(served.came) == 1)
     link = served.came[0].link
-    assert link is not None and link.blocker is None
+    assert link is not None
+    assert link.blocker is None
     door.shut()
     two.send(b"not now")
     await until(lambda: served.foreign.value == 1)

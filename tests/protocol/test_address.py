@@ -10,8 +10,8 @@ from zbridge.protocol.address import (
     DatagramAddress,
     DeviceAddress,
     SerialAddress,
-    parse_datagram_address,
     parse_device_address,
+    parse_port,
 )
 
 ADDRESSES: dict[str, DeviceAddress] = {
@@ -70,21 +70,21 @@ def test_a_listener_may_be_at_an_address_of_tls_and_a_robot_may_not() -> None:
 
 
 def test_where_the_protocol_allows_it_peers_are_at_udp_ports() -> None:
+    schemes = ("tcp", "udp", "udp-in")
     for text, address in {
         "udp://robot.test:14550": DatagramAddress("robot.test", 14550),
         "udp-in://[::]:14550": DatagramAddress("::", 14550, waits=True),
         **ADDRESSES,
     }.items():
-        assert parse_device_address(text, datagrams=True) == address
+        assert parse_device_address(text, schemes) == address
         assert str(address) == text
-    assert Address.parse_listener("udp://0.0.0.0:14550", datagrams=True) == DatagramAddress("0.0.0.0", 14550)
-    assert Address.parse_listener("tcp://a:1", datagrams=True) == Address("a", 1) != DatagramAddress("a", 1)
-    assert parse_datagram_address("udp://desk:14550") == DatagramAddress("desk", 14550)
-    device = "expected tcp://host:port, udp://host:port, udp-in://host:port or serial:///path?baud=N"
+    assert parse_port("udp://0.0.0.0:14550", ("tcp", "udp")) == DatagramAddress("0.0.0.0", 14550)
+    assert parse_port("tcp://a:1", ("tcp", "udp")) == Address("a", 1) != DatagramAddress("a", 1)
+    every = "expected tcp://host:port or udp://host:port or udp-in://host:port or serial:///path?baud=N"
     for parse, text, expected in (
-        (lambda text: parse_device_address(text, datagrams=True), "udp://a", device),
-        (lambda text: Address.parse_listener(text, datagrams=True), "udp-in://a:1", "expected tcp://host:port or udp:"),
-        (parse_datagram_address, "tcp://a:1", "expected udp://host:port"),
+        (lambda text: parse_device_address(text, schemes), "udp://a", every),
+        (lambda text: parse_port(text, ("tcp", "udp")), "udp-in://a:1", "expected tcp://host:port or udp://host:port"),
+        (lambda text: parse_port(text, ("udp",)), "tcp://a:1", "expected udp://host:port"),
         (parse_device_address, "udp-in://a:1", "expected tcp://host:port or serial:///path?baud=N"),
     ):
         with pytest.raises(LinkError, match=re.escape(repr(text)) + ".*" + re.escape(expected)):

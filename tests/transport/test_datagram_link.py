@@ -149,7 +149,6 @@ async def test_a_paused_link_reads_later_and_a_suspended_one_leaves_it_to_its_su
     link.resume_reading()
     await near.until("received", received=6)
     link.suspend()
-    link.resume_reading()
     robot.sendto(b"early", gateway)
     await asyncio.sleep(0.02)
     assert (near.data, link.blocker) == (b"paused", None)

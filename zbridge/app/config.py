@@ -24,7 +24,7 @@ from zbridge.control.settings import ControlSettings
 from zbridge.errors import ConfigError, LinkError
 from zbridge.fleet.topics import is_name
 from zbridge.hq import HqSettings, ListenerPlan
-from zbridge.protocol.address import Address, DatagramAddress, parse_datagram_address
+from zbridge.protocol.address import Address, DatagramAddress, parse_port
 from zbridge.protocol.networks import parse_networks
 from zbridge.protocol.plugin import find_protocol
 from zbridge.robot.settings import DevicePlan, DeviceSettings
@@ -172,9 +172,9 @@ def plan(raw: dict[str, Any], environment: Mapping[str, str] = os.environ) -> Ga
     for number, own in enumerate(names):
         if own is not None and names.count(own) > 1:
             raise ConfigError(f"hq[{number}].name = {own!r}: expected a name of its own")
-    ports = [listener.address for listener in listeners]
+    ports = [msgspec.structs.replace(listener.address, tls=False) for listener in listeners]
     for number, at in enumerate(ports):
-        if at.port and sum(_same_port(at, other) for other in ports) > 1:
+        if at.port and ports.count(at) > 1:
             raise ConfigError(f"hq[{number}].listen = {config.hq[number].listen!r}: expected an address of its own")
     metrics = config.metrics.address if config.metrics is not None else None
     camera = plan_camera(config.camera) if config.camera is not None else None
@@ -209,18 +209,13 @@ def _listener(settings: HqSettings, key: str) -> ListenerPlan:
     options = convert(settings.options, protocol.hq_options, f"{key}.options.")
     allow = parse_networks(f"{key}.allow", settings.allow)
     with prefixed(f"{key}.listen = ", LinkError):
-        address = Address.parse_listener(settings.listen, datagrams=protocol.datagrams)
+        tls = settings.listen.startswith("tls://")
+        address = Address.parse_listener(settings.listen) if tls else protocol.port(settings.listen)
     if settings.to and not isinstance(address, DatagramAddress):
         raise ConfigError(f"{key}.to = {list(settings.to)}: expected only with listen = 'udp://host:port'")
     with prefixed(f"{key}.to = ", LinkError):
-        to = tuple(map(parse_datagram_address, settings.to))
+        to = tuple(parse_port(each, ("udp",)) for each in settings.to)
     return ListenerPlan(protocol, options, address, settings, allow, _listener_tls(key, settings, address), to)
-
-
-def _same_port(one: Address, other: Address) -> bool:
-    """Return whether two listeners would use one port, of TCP or of UDP."""
-    both = isinstance(one, DatagramAddress) is isinstance(other, DatagramAddress)
-    return both and (one.host, one.port) == (other.host, other.port)
 
 
 def _listener_tls(key: str, settings: HqSettings, address: Address) -> SSLContext | None:

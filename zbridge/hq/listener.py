@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from functools import partial
 from typing import Any
 
 from zbridge.clocks import Clocks
@@ -26,12 +27,13 @@ from zbridge.hq.robot_subscription import RobotSubscription
 from zbridge.hq.settings import ListenerPlan
 from zbridge.log import Log
 from zbridge.metrics import Metrics
+from zbridge.protocol.address import DatagramAddress
 from zbridge.protocol.kept import Exported
 from zbridge.protocol.plugin import ATTEND_S
 from zbridge.protocol.session import Limits, Session
 from zbridge.protocol.session_table import SessionTable
 from zbridge.tasks import Tasks
-from zbridge.transport import Accepted, Conversation, Link, Parcel, Receiver, TlsLink, listen, make_door
+from zbridge.transport import Accepted, Conversation, Door, Link, Parcel, Receiver, SourceDoor, TlsLink, listen
 from zbridge.transport.kernel import KERNEL, Kernel
 
 log = Log("zbridge.hq")
@@ -82,8 +84,8 @@ class Listener:
         if (tls := plan.tls) is not None:
             self._secured = lambda receiver: TlsLink(receiver, tls, plan.settings.handshake_s)
         self._closing = False
-        door = (exported[0]["door"], exported[1]) if exported is not None else None
-        self._door = make_door(plan.address, door, kernel, plan.to)
+        kind = partial(SourceDoor, to=plan.to) if isinstance(plan.address, DatagramAddress) else Door
+        self._door = kind(exported[0]["door"], exported[1], kernel) if exported is not None else kind(kernel=kernel)
         self.handover = ListenerHandover(context, self._door, self.clients, self._numbers, self._add)
         """How the listener is handed to another process."""
 

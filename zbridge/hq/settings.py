@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 
-from zbridge.protocol.address import Address, DatagramAddress
+from zbridge.protocol.address import Address
 from zbridge.protocol.networks import Network
 from zbridge.protocol.plugin import Protocol
 
@@ -67,4 +67,4 @@ class ListenerPlan(msgspec.Struct, frozen=True):
     settings: HqSettings
     allow: tuple[Network, ...]
     tls: SSLContext | None = None
-    to: tuple[DatagramAddress, ...] = ()
+    to: tuple[Address, ...] = ()

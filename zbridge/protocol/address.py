@@ -13,8 +13,6 @@ import msgspec
 from zbridge.errors import LinkError
 
 _TCP = "tcp://host:port"
-_UDP = "udp://host:port"
-_UDP_IN = "udp-in://host:port"
 _TLS = "tls://"
 _SERIAL = "serial:///path?baud=N"
 
@@ -35,13 +33,10 @@ class Address(msgspec.Struct, frozen=True):
         return _port(text, parts, _TCP, ("tcp",))
 
     @classmethod
-    def parse_listener(cls, text: str, *, datagrams: bool = False) -> Address:
-        """Read ``tcp://host:port`` or ``tls://host:port``; raise LinkError that names what was expected.
-
-        datagrams: or ``udp://host:port``, a :class:`DatagramAddress`.
-        """
+    def parse_listener(cls, text: str) -> Address:
+        """Read ``tcp://host:port`` or ``tls://host:port``; raise LinkError that names what was expected."""
         if not text.startswith(_TLS):
-            return parse_port(text, datagrams=datagrams)
+            return cls.parse(text)
         plain = "tcp" + text[3:]
         try:
             found = cls.parse(plain)
@@ -55,10 +50,7 @@ class Address(msgspec.Struct, frozen=True):
 
 
 class DatagramAddress(Address, frozen=True):
-    """A UDP port, for datagrams alone: ``udp://host:port``. waits: for the peer to speak first: ``udp-in://host:port``.
-
-    The port is the peer's, or our own where we wait.
-    """
+    """A UDP port, for datagrams alone: ``udp://host:port``; ours where we wait for the peer to speak: ``udp-in://``."""
 
     waits: bool = False
 
@@ -95,30 +87,21 @@ DeviceAddress = Address | SerialAddress | ZenohAddress
 """Where a robot is."""
 
 
-def parse_device_address(text: str, *, datagrams: bool = False) -> DeviceAddress:
-    """Read ``tcp://host:port`` or ``serial:///path?baud=N``; raise LinkError that names what was expected.
-
-    datagrams: or ``udp://host:port``, or ``udp-in://host:port``.
-    """
-    expected = f"{_TCP}, {_UDP}, {_UDP_IN} or {_SERIAL}" if datagrams else f"{_TCP} or {_SERIAL}"
+def parse_device_address(text: str, schemes: tuple[str, ...] = ("tcp",)) -> DeviceAddress:
+    """Read ``tcp://host:port`` or ``serial:///path?baud=N``; raise LinkError that names what was expected."""
+    expected = f"{_expected(schemes)} or {_SERIAL}"
     parts = _split(text, expected)
-    schemes = ("tcp", "udp", "udp-in") if datagrams else ("tcp",)
     return _serial(text, parts) if parts.scheme == "serial" else _port(text, parts, expected, schemes)
 
 
-def parse_port(text: str, *, datagrams: bool = False) -> Address:
-    """Read ``tcp://host:port``, and with ``datagrams`` also ``udp://host:port``; raise LinkError."""
-    if not datagrams:
-        return Address.parse(text)
-    expected = f"{_TCP} or {_UDP}"
-    return _port(text, _split(text, expected), expected, ("tcp", "udp"))
+def parse_port(text: str, schemes: tuple[str, ...]) -> Address:
+    """Read a port of one of the schemes ``tcp``, ``udp``, ``udp-in``; raise LinkError that names them."""
+    expected = _expected(schemes)
+    return _port(text, _split(text, expected), expected, schemes)
 
 
-def parse_datagram_address(text: str) -> DatagramAddress:
-    """Read ``udp://host:port``; raise LinkError."""
-    found = _port(text, _split(text, _UDP), _UDP, ("udp",))
-    assert isinstance(found, DatagramAddress)
-    return found
+def _expected(schemes: tuple[str, ...]) -> str:
+    return " or ".join(f"{scheme}://host:port" for scheme in schemes)
 
 
 def _split(text: str, expected: str) -> SplitResult:

@@ -333,13 +333,13 @@ class Protocol(msgspec.Struct, frozen=True):
     def device_address(self, text: str) -> DeviceAddress:
         """Read the address of a robot of this protocol; raise LinkError that names what was expected."""
         if not self.keyed:
-            return parse_device_address(text, datagrams=self.datagrams)
+            return parse_device_address(text, ("tcp", "udp", "udp-in") if self.datagrams else ("tcp",))
         router = Address.parse(text)
         return ZenohAddress(router.host, router.port)
 
     def port(self, text: str) -> Address:
         """Read where a listener or a simulated robot of this protocol is; raise LinkError."""
-        return parse_port(text, datagrams=self.datagrams)
+        return parse_port(text, ("tcp", "udp")) if self.datagrams else Address.parse(text)
 
 
 def protocol_names() -> tuple[str, ...]:

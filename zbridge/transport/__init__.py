@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from zbridge.transport.accepted import Accepted, ClientConversation
-from zbridge.transport.by_address import attach, connect, listen, make_door
+from zbridge.transport.by_address import attach, connect
 from zbridge.transport.conversation import Conversation, ConversationHooks
 from zbridge.transport.door import Door
 from zbridge.transport.link import Link, Receiver
-from zbridge.transport.tcp import TcpLink
+from zbridge.transport.sources import SourceDoor
+from zbridge.transport.tcp import TcpLink, listen
 from zbridge.transport.tls import TlsLink, server_context
 from zbridge.transport.transferable import Parcel, Transferable
 
@@ -20,12 +21,12 @@ __all__ = [
     "Link",
     "Parcel",
     "Receiver",
+    "SourceDoor",
     "TcpLink",
     "TlsLink",
     "Transferable",
     "attach",
     "connect",
     "listen",
-    "make_door",
     "server_context",
 ]

@@ -1,16 +1,11 @@
-"""Connects to a robot, and listens for peers, whatever kind of link leads to them."""
+"""Connects to a robot, whatever kind of link leads to it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import AbstractAsyncContextManager
-
 from zbridge.errors import ProtocolError
-from zbridge.metrics import Count
-from zbridge.protocol.address import Address, DatagramAddress, DeviceAddress, SerialAddress, ZenohAddress
+from zbridge.protocol.address import DatagramAddress, DeviceAddress, SerialAddress, ZenohAddress
 from zbridge.protocol.kept import Exported
-from zbridge.transport import datagram_link, serial, sources, tcp
-from zbridge.transport.door import Door
+from zbridge.transport import datagram_link, serial, tcp
 from zbridge.transport.kernel import KERNEL, Kernel
 from zbridge.transport.link import Link, Receiver
 from zbridge.transport.transferable import Parcel
@@ -49,35 +44,3 @@ async def attach(
     if isinstance(address, DatagramAddress):
         return datagram_link.attach(state, parcel, receiver, kernel)
     return await tcp.attach(state, parcel, receiver, kernel)
-
-
-def listen(
-    address: Address,
-    receiver: Callable[[], Receiver],
-    *,
-    datagrams: bool = False,
-    foreign: Count | None = None,
-    secured: Callable[[Receiver], Receiver] | None = None,
-    door: Door | None = None,
-) -> AbstractAsyncContextManager[Address]:
-    """Accept peers as :func:`zbridge.transport.tcp.listen` does; at a UDP port by :func:`zbridge.transport.sources`.
-
-    door: of a UDP port a :class:`~zbridge.transport.sources.SourceDoor`.
-    """
-    if not isinstance(address, DatagramAddress):
-        return tcp.listen(address, receiver, datagrams=datagrams, foreign=foreign, secured=secured, door=door)
-    made = door if isinstance(door, sources.SourceDoor) else sources.SourceDoor()
-    return sources.listen(address, receiver, foreign or Count(), made)
-
-
-def make_door(
-    address: Address,
-    exported: tuple[Exported, Parcel] | None,
-    kernel: Kernel = KERNEL,
-    to: tuple[DatagramAddress, ...] = (),
-) -> Door:
-    """Make the door of a listener. exported: as another process exported it. to: see :class:`SourceDoor`."""
-    state, parcel = exported if exported is not None else (None, None)
-    if isinstance(address, DatagramAddress):
-        return sources.SourceDoor(state, parcel, kernel, to)
-    return Door(state, parcel, kernel)

@@ -7,20 +7,20 @@ reports a refusal (the robot's program does not run) as an error of the next cal
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import socket
 from typing import Any
 
 from zbridge.errors import LinkError
-from zbridge.protocol.address import DatagramAddress
+from zbridge.protocol.address import Address, DatagramAddress
 from zbridge.protocol.kept import Exported
 from zbridge.transport.kernel import KERNEL, Kernel
 from zbridge.transport.link import Link, Receiver
-from zbridge.transport.tcp import CONNECT_S
 from zbridge.transport.transferable import Parcel
 from zbridge.transport.udp import DATAGRAM_BYTES
 
-_READS = 4
-"""Most calls without a datagram in a turn of the event loop: refusals, and datagrams from elsewhere."""
+CONNECT_S = 5.0
+"""Seconds until an address is resolved, and a robot that speaks first has spoken."""
 
 
 class DatagramLink(Link):
@@ -32,101 +32,75 @@ class DatagramLink(Link):
         super().__init__(receiver)
         self._source = sock.getpeername()[:2]
         self.peer = str(DatagramAddress(*self._source))
-        self._socket: socket.socket | None = sock
+        self._socket = sock
         self._loop = asyncio.get_running_loop()
-        self._reading = self._suspended = False
         self._refused = False
         """Whether a write met an error that the event loop may have seen too."""
 
-    def __repr__(self) -> str:
-        return f"<DatagramLink {self.peer}>"
-
-    def begin(self, first: bytes | None = None) -> None:
+    def begin(self, first: bytes | None = None) -> DatagramLink:
         """Attach the receiver and begin to read; called once. first: a datagram that was read already."""
         self.resume_reading()
         self.receiver.attached(self)
         if first is not None:
             self.receiver.received(first)
+        return self
 
     @property
     def descriptors(self) -> tuple[int, ...]:
-        return (self._socket.fileno(),) if self._socket is not None else ()
+        return (self._socket.fileno(),) if self.ready else ()
 
     @property
     def ready(self) -> bool:
-        return self._socket is not None
+        return self._socket.fileno() >= 0
 
     def write(self, data: bytes) -> None:
         """Send ``data`` as one datagram; it is lost, and ``unsent`` called, if the kernel does not accept it now."""
-        if self._socket is None:
-            return
-        try:
+        for _ in range(2 if self.ready else 0):
             try:
                 self._socket.send(data)
             except ConnectionRefusedError:  # of an earlier datagram: this one was not sent
                 self._refused = True
-                self._socket.send(data)
-        except OSError:
-            self.unsent()
-
-    write_datagram = write
+            except OSError:
+                self.unsent()
+                return
+            else:
+                return
 
     def pause_reading(self) -> None:
-        if self._reading and self._socket is not None:
+        if self.ready:
             self._loop.remove_reader(self._socket.fileno())
-        self._reading = False
 
     def resume_reading(self) -> None:
-        if self._socket is not None and not self._reading and not self._suspended:
-            self._reading = True
+        if self.ready:
             self._loop.add_reader(self._socket.fileno(), self._read)
-
-    def suspend(self) -> None:
-        self._suspended = True
-        self.pause_reading()
-
-    def resume(self) -> None:
-        self._suspended = False
-        self.resume_reading()
 
     def export(self, parcel: Parcel) -> Exported:
         """Put the socket into a parcel: it knows its peer."""
-        assert self._socket is not None
         return {"udp": parcel.put(self._socket.fileno())}
 
     def detach(self) -> None:
-        """Give up the own descriptor of a socket that another process has now."""
         self.receiver = Receiver()
         self.abort()
 
-    def close(self) -> None:
-        self.abort()
-
     def abort(self) -> None:
-        if self._socket is not None:
+        if self.ready:
             self.pause_reading()
-            sock, self._socket = self._socket, None
-            sock.close()
+            self._socket.close()
             self._loop.call_soon(self.receiver.lost, "closed")
+
+    close = abort
 
     def _read(self) -> None:
         """Read one datagram; the receiver gets b"" if there is none: who watches the reads must learn that."""
-        if self._socket is None:
-            return
         self.reads()
         data, refused, self._refused = b"", self._refused, False
-        for _ in range(_READS):
-            try:
-                found, source = self._socket.recvfrom(DATAGRAM_BYTES)
-            except OSError as error:
-                refused = True
-                if isinstance(error, BlockingIOError):
-                    break
-            else:
-                if source[:2] == self._source:
-                    data = found
-                    break
+        try:
+            data, source = self._socket.recvfrom(DATAGRAM_BYTES)
+            if source[:2] != self._source:
+                data = b""
                 self.receiver.foreign_datagram()
+        except OSError:
+            refused = True
         if refused:  # uvloop watches a socket no more that had an error
             self.pause_reading()
             self.resume_reading()
@@ -135,53 +109,42 @@ class DatagramLink(Link):
 
 async def connect(address: DatagramAddress, receiver: Receiver, kernel: Kernel = KERNEL) -> DatagramLink:
     """Connect a socket to the robot, or wait for its first datagram, for :data:`CONNECT_S`; raise LinkError."""
-    sock = None
-    try:
-        async with asyncio.timeout(CONNECT_S):
-            where = await resolved(address)
-            if not address.waits:
-                sock = kernel.datagrams("::" if ":" in where[0] else "0.0.0.0", 0)
+    first = None
+    with contextlib.ExitStack() as failed:
+        try:
+            async with asyncio.timeout(CONNECT_S):
+                where = await resolved(address)
+                ours = where[:2] if address.waits else ("::" if ":" in where[0] else "0.0.0.0", 0)
+                sock = kernel.datagrams(*ours)
+                failed.callback(sock.close)
+                if address.waits:
+                    await _readable(sock)
+                    first, where = sock.recvfrom(DATAGRAM_BYTES)
                 sock.connect(where)
-                first = None
-            else:
-                sock = kernel.datagrams(*where[:2])
-                await _readable(sock)
-                first, source = sock.recvfrom(DATAGRAM_BYTES)
-                sock.connect(source)
-        link = DatagramLink(sock, receiver)
-    except BaseException as error:
-        if sock is not None:
-            sock.close()
-        if isinstance(error, TimeoutError):
-            missing = "datagram" if address.waits else "address"
-            raise LinkError(f"{address}: no {missing} within {CONNECT_S:g} s") from error
-        if isinstance(error, OSError | UnicodeError):
-            raise LinkError(f"{address}: {getattr(error, 'strerror', None) or error}") from error
-        raise
-    link.begin(first)
-    return link
+                link = DatagramLink(sock, receiver)
+        except (OSError, UnicodeError) as error:
+            reason = getattr(error, "strerror", None) or str(error) or f"no datagram within {CONNECT_S:g} s"
+            raise LinkError(f"{address}: {reason}") from error
+        failed.pop_all()
+    return link.begin(first)
 
 
 def attach(state: Exported, parcel: Parcel, receiver: Receiver, kernel: Kernel = KERNEL) -> DatagramLink:
     """Attach ``receiver`` to the socket that another process handed over; raise ProtocolError, OSError."""
     sock = kernel.adopt(parcel.take(state.get("udp")))
     sock.setblocking(False)
-    link = DatagramLink(sock, receiver)
-    link.begin()
-    return link
+    return DatagramLink(sock, receiver).begin()
 
 
-async def resolved(address: DatagramAddress, family: int = socket.AF_UNSPEC) -> tuple[Any, ...]:
-    """Return the address as sockets take it; raise OSError, UnicodeError. family: of the socket."""
+async def resolved(address: Address, family: int = socket.AF_UNSPEC) -> tuple[Any, ...]:
+    """Return the address as sockets of a family take it; raise OSError, UnicodeError."""
     flags = socket.AI_V4MAPPED if family == socket.AF_INET6 else 0
-    found = await asyncio.get_running_loop().getaddrinfo(
-        address.host, address.port, family=family, type=socket.SOCK_DGRAM, flags=flags
-    )
+    look_up = asyncio.get_running_loop().getaddrinfo
+    found = await look_up(address.host, address.port, family=family, type=socket.SOCK_DGRAM, flags=flags)
     return found[0][4]
 
 
 async def _readable(sock: socket.socket) -> None:
-    """Wait until a datagram has come."""
     loop, there = asyncio.get_running_loop(), asyncio.Event()
     loop.add_reader(sock.fileno(), there.set)
     try:

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import TypeVar
 
 from zbridge.errors import ProtocolError
+from zbridge.metrics import Count
 from zbridge.protocol.address import Address
 from zbridge.protocol.kept import Exported
 from zbridge.transport.kernel import KERNEL, Kernel
@@ -38,6 +39,8 @@ class Door:
         self._hub: DatagramHub | None = None
         self._receiver: Callable[[], Receiver]
         self._accept: Accept
+        self.foreign = Count()
+        """Counts datagrams that belong to no client."""
 
     def __repr__(self) -> str:
         return f"<Door of {len(self._sockets)} sockets, {'open' if self._servers else 'shut'}>"

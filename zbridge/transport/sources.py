@@ -11,26 +11,23 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Callable
 
-from zbridge.errors import LinkError, ProtocolError
+from zbridge.errors import ProtocolError
 from zbridge.metrics import Count
 from zbridge.protocol.address import Address, DatagramAddress
 from zbridge.protocol.kept import Exported
-from zbridge.transport.datagram_link import resolved
-from zbridge.transport.door import Door
+from zbridge.transport.datagram_link import CONNECT_S, resolved
+from zbridge.transport.door import Accept, Door
 from zbridge.transport.kernel import KERNEL, Kernel
 from zbridge.transport.link import Link, Receiver
-from zbridge.transport.tcp import CONNECT_S
 from zbridge.transport.transferable import Parcel
-from zbridge.transport.udp import DatagramReader
+from zbridge.transport.udp import DatagramHub, DatagramReader
 
 Source = tuple[str, int]
 
 SILENT_S = 5.0
 """Seconds without a datagram after which a client is gone."""
-LINKS = 10_000
-"""Most links at a time, whatever the receivers accept."""
 _SWEEPS = 10
 """Calls of :meth:`SourceHub.sweep` within that time."""
 REST_S = 1.0
@@ -39,34 +36,28 @@ RESTING = 1024
 """Most sources that rest; one more clears them all."""
 TO_S = 2.0
 """Seconds between two looks whether there is a link to each address ``to``; its host name is resolved again then."""
-_UNTOLD = Receiver()
 
 
 class SourceLink(Link):
     """What comes from one source, and goes there. The kernel's queue is of all sources: a paused link's are dropped."""
 
     datagrams_only = True
+    silent_sweeps = 0
+    paused = False
 
     def __init__(self, hub: SourceHub, source: Source, receiver: Receiver) -> None:
         super().__init__(receiver)
         self.source = source
         self.peer = str(DatagramAddress(*source))
-        self.silent_sweeps = 0
-        self.paused = False
         self._hub = hub
-
-    def __repr__(self) -> str:
-        return f"<SourceLink {self.peer}>"
 
     @property
     def ready(self) -> bool:
-        return self._hub.has(self)
+        return self._hub.links.get(self.source) is self
 
     def write(self, data: bytes) -> None:
         if self.ready and not self._hub.send(data, self.source):
             self.unsent()
-
-    write_datagram = write
 
     def pause_reading(self) -> None:
         self.paused = True
@@ -79,14 +70,15 @@ class SourceLink(Link):
         return {}
 
     def detach(self) -> None:
-        self.receiver = _UNTOLD
-        self.close()
-
-    def close(self) -> None:
-        self._hub.end(self, "closed", rest_s=REST_S)
+        self.receiver = Receiver()
+        self.abort()
 
     def abort(self) -> None:
-        self.close()
+        if self.ready:
+            self._hub.rest(self.source)
+            self._hub.end(self, "closed")
+
+    close = abort
 
 
 class SourceHub(DatagramReader):
@@ -94,11 +86,11 @@ class SourceHub(DatagramReader):
 
     def __init__(self, receiver: Callable[[], Receiver], foreign: Count, kernel: Kernel) -> None:
         super().__init__(kernel)
+        self.links: dict[Source, SourceLink] = {}
         self.admits = False
         """Whether new sources get links."""
         self._receiver = receiver
         self._foreign = foreign
-        self._links: dict[Source, SourceLink] = {}
         self._resting: dict[Source, float] = {}
         self._timer = self._loop.call_later(SILENT_S / _SWEEPS, self.sweep)
 
@@ -108,60 +100,54 @@ class SourceHub(DatagramReader):
         assert self._socket is not None
         return self._socket
 
-    def has(self, link: SourceLink) -> bool:
-        """Return whether a link has not ended."""
-        return self._links.get(link.source) is link
-
     def link(self, source: Source, receiver: Receiver | None = None) -> SourceLink:
         """Return the link of a source, made if there is none; one that was refused has ended already."""
-        link = self._links.get(source)
+        link = self.links.get(source)
         if link is None:
-            link = self._links[source] = SourceLink(self, source, receiver or self._receiver())
+            link = self.links[source] = SourceLink(self, source, receiver or self._receiver())
             link.receiver.attached(link)
         return link
 
     def send(self, data: bytes, source: Source) -> bool:
         """Send a datagram; return whether the kernel accepted it."""
         with contextlib.suppress(OSError):
-            return self._socket is not None and self._socket.sendto(data, source) == len(data)
+            return self.bound.sendto(data, source) == len(data)
         return False
 
-    def end(self, link: SourceLink, reason: str, rest_s: float = 0.0) -> None:
-        """End a link, and tell its receiver later; idempotent."""
-        if not self.has(link):
-            return
-        del self._links[link.source]
-        if rest_s:
-            if len(self._resting) >= RESTING:
-                self._resting.clear()
-            self._resting[link.source] = self._loop.time() + rest_s
+    def end(self, link: SourceLink, reason: str) -> None:
+        """End a link, and tell its receiver later."""
+        del self.links[link.source]
         self._loop.call_soon(link.receiver.lost, reason)
+
+    def rest(self, source: Source) -> None:
+        """Give a source no link for :data:`REST_S`."""
+        if len(self._resting) >= RESTING:
+            self._resting.clear()
+        self._resting[source] = self._loop.time() + REST_S
 
     def sweep(self) -> None:
         """End the links that are silent. Sweeps are counted, not time: this process may have been frozen."""
         self._timer = self._loop.call_later(SILENT_S / _SWEEPS, self.sweep)
         now = self._loop.time()
         self._resting = {source: until for source, until in self._resting.items() if now < until}
-        for link in tuple(self._links.values()) if not self._suspended else ():
+        for link in tuple(self.links.values()) if not self._suspended else ():
             link.silent_sweeps += 1
             if link.silent_sweeps > _SWEEPS and not link.lasting:
                 self.end(link, f"silent for {SILENT_S:g} s")
 
     def close(self) -> None:
-        """Close the socket, and end all links; idempotent."""
         super().close()
         self._timer.cancel()
-        for link in tuple(self._links.values()):
+        for link in tuple(self.links.values()):
             self.end(link, "closed")
 
     def _take(self, data: bytes, source: Source) -> None:
-        if source not in self._links:
-            rests = self._loop.time() < self._resting.get(source, 0.0)
-            if rests or not self.admits or len(self._links) >= LINKS:
+        if source not in self.links:
+            if not self.admits or self._loop.time() < self._resting.get(source, 0.0):
                 self._foreign.value += 1
                 return
             self.link(source)
-        link = self._links.get(source)
+        link = self.links.get(source)
         if link is not None and not link.paused:
             link.silent_sweeps = 0
             link.receiver.received(data)
@@ -170,34 +156,30 @@ class SourceHub(DatagramReader):
 class SourceDoor(Door):
     """The socket of a listener at a UDP port. to: addresses that get links unasked."""
 
+    _sources: SourceHub
+
     def __init__(
         self,
         state: Exported | None = None,
         parcel: Parcel | None = None,
         kernel: Kernel = KERNEL,
-        to: tuple[DatagramAddress, ...] = (),
+        to: tuple[Address, ...] = (),
     ) -> None:
         super().__init__(state, parcel, kernel)
         self._to = to
         self._calls: asyncio.Task[None] | None = None
-        self._sources: SourceHub
 
-    def __repr__(self) -> str:
-        return "<SourceDoor>"
-
-    async def begin(self, address: Address, receiver: Callable[[], Receiver], foreign: Count) -> DatagramAddress:
-        """Bind the address and open, or take the socket over; return the address with its port. Raise OSError."""
-        self._sources = hub = SourceHub(receiver, foreign, self.kernel)
-        self._hub = hub  # type: ignore[assignment]  # the door suspends, exports and closes it
+    async def bind(
+        self, address: Address, receiver: Callable[[], Receiver], accept: Accept, hub: DatagramHub | None
+    ) -> Address:
+        self._sources = sources = SourceHub(receiver, self.foreign, self.kernel)
+        self._hub = sources  # type: ignore[assignment]  # the base suspends and exports it
         if self._state is not None:
-            if self._state["tcp"]:
-                raise ProtocolError("other sockets than this listener's")
-            hub.restore(self.kernel.adopt(self._parcel.take(self._state["udp"])))
+            sources.restore(self.kernel.adopt(self._parcel.take(self._state["udp"])))
         else:
-            where = await resolved(DatagramAddress(address.host, address.port))
-            hub.open(*where[:2])
+            sources.open(*(await resolved(address))[:2])
             await self.open()
-        return DatagramAddress(*hub.bound.getsockname()[:2])
+        return DatagramAddress(*sources.bound.getsockname()[:2])
 
     async def open(self) -> None:
         """Give new sources links, for the first time or again."""
@@ -208,7 +190,8 @@ class SourceDoor(Door):
 
     def shut(self) -> None:
         """Give no new source a link until :meth:`open`: it sends again."""
-        self._sources.admits = False
+        if self._hub is not None:
+            self._sources.admits = False
 
     def source(self, link: Link) -> Source | None:
         return link.source if isinstance(link, SourceLink) else None
@@ -222,41 +205,20 @@ class SourceDoor(Door):
     def close(self) -> None:
         if self._calls is not None:
             self._calls.cancel()
-        if self._hub is not None:
-            self._hub.close()
+        super().close()
 
     async def _call(self) -> None:
         """See that there is a link to each address ``to``, where it is now, and that it lasts."""
-        links: dict[DatagramAddress, SourceLink] = {}
+        links: dict[Address, SourceLink] = {}
         while True:
             for address in self._to:
-                found = None
                 with contextlib.suppress(OSError, UnicodeError):  # it may be known later
                     async with asyncio.timeout(CONNECT_S):
                         found = (await resolved(address, self._sources.bound.family))[:2]
-                before = links.get(address)
-                if found is None or not self._sources.admits or (before and before.ready and before.source == found):
-                    continue
-                if before is not None:
-                    before.lasting = False  # ends by its silence
-                links[address] = link = self._sources.link(found)
-                link.lasting = True
+                    before = links.get(address)
+                    if before is not None:
+                        before.lasting = before.source == found  # else it ends by its silence
+                    if self._sources.admits and not (before and before.ready and before.lasting):
+                        links[address] = link = self._sources.link(found)
+                        link.lasting = True
             await asyncio.sleep(TO_S)
-
-
-@contextlib.asynccontextmanager
-async def listen(
-    address: Address, receiver: Callable[[], Receiver], foreign: Count, door: SourceDoor
-) -> AsyncIterator[Address]:
-    """Serve the sources that send to an address, each with a receiver of its own; return the address with its port.
-
-    foreign: counts datagrams of sources without a link. Raise LinkError if the address cannot be bound.
-    """
-    try:
-        try:
-            bound = await door.begin(address, receiver, foreign)
-        except (OSError, UnicodeError) as error:
-            raise LinkError(f"{address}: {getattr(error, 'strerror', None) or error}") from error
-        yield bound
-    finally:
-        door.close()

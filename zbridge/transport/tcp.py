@@ -16,12 +16,13 @@ from typing import cast
 from zbridge.errors import LinkError
 from zbridge.log import Log
 from zbridge.metrics import Count
-from zbridge.protocol.address import Address
+from zbridge.protocol.address import Address, DatagramAddress
 from zbridge.protocol.kept import Exported
 from zbridge.transport.backlog import LEAST_S, Backlog
 from zbridge.transport.door import Door, make_link
 from zbridge.transport.kernel import KERNEL, Kernel
 from zbridge.transport.link import STALLED_S, Link, Receiver, unwatched
+from zbridge.transport.sources import SourceDoor
 from zbridge.transport.tcp_options import KEEPALIVE_S, bound_retries, keep_alive, new_backlog, outstanding, tune
 from zbridge.transport.transferable import Parcel
 from zbridge.transport.udp import DatagramHub, DatagramSocket
@@ -293,11 +294,12 @@ async def listen(
 
     ``datagrams``: serve UDP on the same port number too; ``foreign`` counts datagrams that belong to no client.
     ``secured`` puts a filter before each receiver (TLS); then there are no datagrams. ``door``: keeps the sockets, to
-    be shut or handed over. Raise LinkError if the address cannot be bound.
+    be shut or handed over; at ``udp://`` a SourceDoor. Raise LinkError if the address cannot be bound.
     """
-    door = door or Door()
+    door = door or (SourceDoor() if isinstance(address, DatagramAddress) else Door())
+    door.foreign = foreign = foreign or Count()
     kernel = door.kernel
-    hub = DatagramHub(foreign or Count(), kernel) if datagrams and secured is None else None
+    hub = DatagramHub(foreign, kernel) if datagrams and secured is None else None
     make = receiver if secured is None else lambda: secured(receiver())
     buffer = bytearray(CLIENT_READ_BYTES)
     async with contextlib.AsyncExitStack() as stack:
@@ -305,6 +307,6 @@ async def listen(
             stack.callback(door.close)
             accept = partial(TcpLink, hub=hub, buffer=buffer, accepted=True, kernel=kernel)
             bound = await door.bind(address, make, accept, hub)
-        except OSError as error:
-            raise LinkError(f"{address}: {error.strerror or error}") from error
+        except (OSError, UnicodeError) as error:
+            raise LinkError(f"{address}: {getattr(error, 'strerror', None) or error}") from error
         yield bound

@@ -136,8 +136,6 @@ class FrameBuffer:
 class DatagramFrames(FrameBuffer):
     """Cuts datagrams into frames: what a datagram has beside whole frames is dropped. dropped: takes the reason."""
 
-    __slots__ = ("_dropped",)
-
     def __init__(self, frame_end: FrameEnd, limit: int, dropped: Callable[[str], object]) -> None:
         super().__init__(frame_end, limit)
         self._dropped = dropped
@@ -152,7 +150,6 @@ class DatagramFrames(FrameBuffer):
             self._dropped(str(error))
         finally:
             self._rest.clear()
-            self._needed = 0
 
 
 def _name(function: FrameEnd) -> str:

@@ -66,6 +66,8 @@ class DatagramLink(Link):
             else:
                 return
 
+    write_datagram = write
+
     def pause_reading(self) -> None:
         if self.ready:
             self._loop.remove_reader(self._socket.fileno())

@@ -59,6 +59,8 @@ class SourceLink(Link):
         if self.ready and not self._hub.send(data, self.source):
             self.unsent()
 
+    write_datagram = write
+
     def pause_reading(self) -> None:
         self.paused = True
 
@@ -75,8 +77,7 @@ class SourceLink(Link):
 
     def abort(self) -> None:
         if self.ready:
-            self._hub.rest(self.source)
-            self._hub.end(self, "closed")
+            self._hub.end(self, "closed", rests=True)
 
     close = abort
 
@@ -114,16 +115,14 @@ class SourceHub(DatagramReader):
             return self.bound.sendto(data, source) == len(data)
         return False
 
-    def end(self, link: SourceLink, reason: str) -> None:
-        """End a link, and tell its receiver later."""
+    def end(self, link: SourceLink, reason: str, *, rests: bool = False) -> None:
+        """End a link, and tell its receiver later. rests: its source gets no other one for :data:`REST_S`."""
         del self.links[link.source]
         self._loop.call_soon(link.receiver.lost, reason)
-
-    def rest(self, source: Source) -> None:
-        """Give a source no link for :data:`REST_S`."""
-        if len(self._resting) >= RESTING:
-            self._resting.clear()
-        self._resting[source] = self._loop.time() + REST_S
+        if rests:
+            if len(self._resting) >= RESTING:
+                self._resting.clear()
+            self._resting[link.source] = self._loop.time() + REST_S
 
     def sweep(self) -> None:
         """End the links that are silent. Sweeps are counted, not time: this process may have been frozen."""

@@ -307,6 +307,6 @@ async def listen(
             stack.callback(door.close)
             accept = partial(TcpLink, hub=hub, buffer=buffer, accepted=True, kernel=kernel)
             bound = await door.bind(address, make, accept, hub)
-        except (OSError, UnicodeError) as error:
-            raise LinkError(f"{address}: {getattr(error, 'strerror', None) or error}") from error
+        except OSError as error:
+            raise LinkError(f"{address}: {error.strerror or error}") from error
         yield bound

@@ -65,7 +65,6 @@ keep = 20                               # incidents; older ones are deleted
 """
 LISTENER_TEMPLATE = """\
 # name = "desk"                         # of the listener on the bus; left out: from its protocol and the process
-# to = ["udp://desk:14550"]             # with listen = "udp://HOST:PORT": clients that need not speak first
 clients = 256                           # most at a time; further ones are refused
 accept_hz = 20.0                        # connections a second from one address; further ones are refused
 handshake_s = 5.0                       # longest time for a client's handshake

@@ -34,7 +34,8 @@ from zbridge.protocol import (
 TEMPLATE = """\
 [device]
 protocol = "mavlink"
-connect = ["tcp://127.0.0.1:5760"]      # or ["serial:///dev/ttyUSB0?baud=57600"]
+connect = ["tcp://127.0.0.1:5760"]      # or "serial:///dev/ttyUSB0?baud=57600"; "udp://HOST:14550": we speak first;
+                                        # "udp-in://0.0.0.0:14550": the vehicle does
 
 [device.options]
 system_id = 255                         # ours; sticks count only from the rover's MAV_GCS_SYSID
@@ -50,7 +51,8 @@ turn_full_rad_s = 1.0                   # the turn of a drive of 1
 """
 HQ_TEMPLATE = """\
 protocol = "mavlink"
-listen = "tcp://127.0.0.1:5762"         # ground stations connect here
+listen = "tcp://127.0.0.1:5762"         # or "udp://0.0.0.0:14550", with to = ["udp://HOST:14550"] for
+                                        # stations that wait until a vehicle speaks
 [hq.options]
 system_id = 1                           # 1 to 250, of this robot alone: ground stations take two of one id for one
 kind = "rover"                          # or "boat"
@@ -192,6 +194,7 @@ PROTOCOL = Protocol(
     summary="MAVLink: rovers and boats with ArduPilot",
     options=RoverOptions,
     links=1,
+    datagrams=True,
     robot=_robot,
     simulate=_simulate,
     simulated={"arm": "drive"},

@@ -348,10 +348,7 @@ class Session(Kept, ABC, Generic[M]):
         return self._frames.partial(most_bytes)
 
     def restore(self, state: Exported) -> None:
-        """Take over the state of the same session of another process; raise ProtocolError if it has another form.
-
-        To be called in place of :meth:`open`, on a session that was just made from the same settings.
-        """
+        """Take over the state of another process's session, in place of :meth:`open`; raise ProtocolError."""
         super().restore(state)
         if self._watches:
             self.silence.restore(state.get("silence", {}))

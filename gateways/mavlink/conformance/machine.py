@@ -202,7 +202,7 @@ class StationRules:
         self._count(command, int(number))
 
     def _count(self, command: int, number: int) -> None:
-        """Count the sendings of a command ("A command is sent 4 times, 0.5 s apart"); a stop is repeated more often."""
+        """Count the sendings of a command : four times, 0.5 s apart; a stop more often."""
         key, now = (command, number), self._now
         request = self._requests.get(key)
         if request is None or request.over or self._awake_s - request.last_s > _EPISODE_S:
@@ -216,7 +216,7 @@ class StationRules:
             self._violate(f"command {command} ({number}) was sent 4 times within {now - request.first:.2f} s")
 
     def _judge_mode(self, fields: dict[str, Any]) -> None:
-        """Judge DO_SET_MODE ("Stop", "Arming")."""
+        """Judge DO_SET_MODE, and whether it arms."""
         mode, held_s = fields["param2"], self._awake_s - self._shown_s
         if not int(fields["param1"]) & 1:
             self._violate("DO_SET_MODE without the custom mode's bit")
@@ -246,7 +246,7 @@ class StationRules:
         self._judge_pilot("ARM")
 
     def _judge_pilot(self, what: str, *, stops: bool = False) -> None:
-        """Judge what would take the vehicle from who drives it ("Somebody else changes the mode")."""
+        """Judge what would take the vehicle from who drives it."""
         if self._piloted_s is None:
             return
         if stops and self._ordered():
@@ -286,7 +286,7 @@ class StationRules:
         self._move("a stick", moves)
 
     def _move(self, what: str, moves: bool) -> None:
-        """Judge a setpoint or a stick ("Drive", "Stop")."""
+        """Judge a setpoint or a stick."""
         self._judge_pilot(what, stops=not moves)
         self._zeroed, self._motion_s = not moves, self._awake_s if moves else None
         if not moves:

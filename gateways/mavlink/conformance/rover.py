@@ -233,7 +233,7 @@ class JudgedRover:
         return (_MISSION_M_S, 0.0) if self.mode == AUTO else self._wanted
 
     def _fail_safe(self) -> None:
-        """End motion of which no more is heard ("Silence", "GCS failsafe")."""
+        """End motion of which no more is heard: a target, a stick, the ground station."""
         silent_s = self._now - self._wanted_at
         if self.mode == GUIDED and self.armed and silent_s > _GUID_TIMEOUT_S:
             self._wanted, self._wanted_at = (0.0, 0.0), math.inf
@@ -283,7 +283,7 @@ class JudgedRover:
 
 
 def _foreign(system_id: int) -> list[SentMessage]:
-    """Return what others on the link say ("The vehicle": all else is counted, never obeyed)."""
+    """Return what others on the link say, which is counted and never obeyed."""
 
     def beat(source: tuple[int, int], kind: int, autopilot: int, mode: int) -> SentMessage:
         fields = {"type": kind, "autopilot": autopilot, "base_mode": 0x41 | ARMED, "custom_mode": mode}

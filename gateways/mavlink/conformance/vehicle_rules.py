@@ -266,7 +266,7 @@ class VehicleRules:
             self._modes[int(asked.second)] = until_s
 
     def _judge_result(self, asked: _Asked, result: int) -> None:
-        """Judge the result of a command ("Answer", "First motion acquires")."""
+        """Judge the result of a command."""
         command, first, second = asked.command, asked.first, asked.second
         unknown = command in (SET_INTERVAL, REQUEST_MESSAGE) and first not in NAMES
         if unknown and result == ACCEPTED:

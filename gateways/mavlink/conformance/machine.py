@@ -202,7 +202,7 @@ class StationRules:
         self._count(command, int(number))
 
     def _count(self, command: int, number: int) -> None:
-        """Count the sendings of a command : four times, 0.5 s apart; a stop more often."""
+        """Count the sendings of a command: four times, 0.5 s apart; a stop more often."""
         key, now = (command, number), self._now
         request = self._requests.get(key)
         if request is None or request.over or self._awake_s - request.last_s > _EPISODE_S:

@@ -35,10 +35,12 @@ _MOST_WRITES = 10_000
 class Transcript(msgspec.Struct):
     """The frames of the driving link, and whether all links were established. ``answers``: what followed a frame.
 
+    repeated: what the robot sent of itself within a second; empty: the last frame that was received stands for it.
     unanswered: requests without an answer; None: the session sends none.
     """
 
     received: list[bytes] = []
+    repeated: list[bytes] = []
     answers: dict[bytes, list[bytes]] = {}
     messages: list[Any] = []
     established: bool = False
@@ -74,6 +76,8 @@ class Rehearsal:
         self.session: Session[Any] = sessions[0]
         self._recording = recording
         self._begun = False
+        self._repeated = 0
+        """How many frames of the robot's stream were repeated."""
         self._heard_at = self.now
         self.session.open(self.now)
 
@@ -118,7 +122,7 @@ class Rehearsal:
         """Advance the time and write what is due; return what was written. Raise RuntimeError if that never ends.
 
         ``answers``: the robot repeats what it sent after the same frame, once the session is established, and what it
-        sent last of itself, every :data:`AGAIN_S`.
+        sent of itself: a part every :data:`AGAIN_S`, all of it in a second.
         """
         written: list[bytes] = []
         end, session = self.now + seconds, self.session
@@ -157,12 +161,14 @@ class Rehearsal:
         return self.written_for(topics.CMD_DRIVE, command, seconds)
 
     def _repeat_stream(self) -> float:
-        """Let a robot that sends by itself send its last frame again if that is due; return when the next one is."""
-        session, frames = self.session, self._recording.received
+        """Let a robot that sends by itself send some frames again if that is due; return when the next ones are."""
+        session, frames = self.session, self._recording.repeated or self._recording.received[-1:]
         if isinstance(session, ExchangeSession) or session.state is not State.ESTABLISHED or not frames:
             return math.inf
         if self.now >= self._heard_at + AGAIN_S:
-            self._hear(frames[-1])
+            for _ in range(math.ceil(len(frames) * AGAIN_S)):
+                self._hear(frames[self._repeated % len(frames)])
+                self._repeated += 1
         return self._heard_at + AGAIN_S
 
     def _restless(self, written: list[bytes]) -> str:

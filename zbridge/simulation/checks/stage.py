@@ -34,6 +34,7 @@ _LOOK_S = 0.01
 _HANDLED = "ProtocolError for what a robot must not say, and no other exception"
 MOST_RECEIVED = 600
 _MOST_FRAMES = 400
+_MOST_REPEATED = 100
 _ANSWER_FRAMES = 8
 _LAST = 3
 
@@ -292,12 +293,14 @@ async def record(protocol: Protocol, establish_s: float) -> Transcript:
         handshake = len(stage.frames)
         if established:
             await stage.watch(SHOWN_S)
+        told = len(stage.frames)
         received = [frame for direction, frame in stage.frames if direction == "in"][:_MOST_FRAMES]
         messages = list(stage.messages)
         if established:
             await _command(stage)
         return Transcript(
             received,
+            [frame for direction, frame in stage.frames[handshake:told] if direction == "in"][-_MOST_REPEATED:],
             _answers(stage.frames[handshake:]),
             messages,
             established,

@@ -103,7 +103,7 @@ def test_others_are_not_translated_obeyed_or_taken_for_the_rover() -> None:
 def test_a_rover_without_heartbeat_is_lost_after_three_seconds_whatever_else_comes() -> None:
     session, now = opened(vehicle_id=1), 0.1
     hears(session, ROVER, 1, now=now)
-    session.expire(now)
+    hears(session, ROVER, 1, now=now)
     while now < 3.0:
         now += 0.1
         hears(session, Attitude(yaw=1.0), 1, now=now)
@@ -265,6 +265,19 @@ def test_a_stop_is_repeated_until_the_rover_shows_it_and_no_longer() -> None:
     assert (rover.mode, scene.robot.helm.warning) == (RoverMode.HOLD, None)
 
 
+@pytest.mark.parametrize("phase_s", [0.1, 0.3, 0.5, 0.7, 0.9])
+def test_a_stop_takes_the_request_for_our_mode_back(phase_s: float) -> None:
+    scene = begin(rover := DeafRover())
+    scene.run(phase_s)
+    rover.deaf = {Command.DO_SET_MODE: 2}  # the request, and the first HOLD
+    scene.drive(0.5)
+    scene.run(0.05)
+    scene.stop()
+    scene.run(3.0)
+    assert modes(scene)[0] is RoverMode.GUIDED
+    assert set(modes(scene)[1:]) == {RoverMode.HOLD}
+
+
 def test_a_stop_that_is_not_confirmed_ends_after_a_second_and_is_warned_of_until_it_is() -> None:
     scene = begin(rover := DeafRover())
     drive(scene, 0.5)
@@ -365,6 +378,7 @@ def test_a_pilot_may_take_a_rover_that_we_hold() -> None:
         scene.rest(0.0)
         scene.run(1.0)
     assert (scene.simulated.mode, modes(scene, since)) == (RoverMode.MANUAL, [])
+    assert scene.robot.helm.state is HelmState.OTHERS
 
 
 def test_a_new_connection_stops_a_rover_that_is_still_in_our_mode() -> None:

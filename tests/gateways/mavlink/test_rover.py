@@ -265,11 +265,11 @@ def test_a_stop_is_repeated_until_the_rover_shows_it_and_no_longer() -> None:
     assert (rover.mode, scene.robot.helm.warning) == (RoverMode.HOLD, None)
 
 
-@pytest.mark.parametrize("phase_s", [0.1, 0.3, 0.5, 0.7, 0.9])
+@pytest.mark.parametrize("phase_s", [0.1, 0.4, 0.7])
 def test_a_stop_takes_the_request_for_our_mode_back(phase_s: float) -> None:
     scene = begin(rover := DeafRover())
     scene.run(phase_s)
-    rover.deaf = {Command.DO_SET_MODE: 2}  # the request, and the first HOLD
+    rover.deaf = {Command.DO_SET_MODE: 99}
     scene.drive(0.5)
     scene.run(0.05)
     scene.stop()

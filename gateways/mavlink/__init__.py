@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import cast, get_args
+from typing import Any, cast, get_args
 
 from gateways.mavlink.frames import HEADER, MARKER, frame_end, frame_of, read_frame, write_frame
 from gateways.mavlink.messages import MESSAGES, MavlinkMessage, control, telemetry
@@ -122,71 +122,63 @@ async def _simulate_hq(simulation: HqSimulation) -> None:
     await station.simulate(simulation.address.host, simulation.address.port, simulation.drive)
 
 
-_hex = bytes.fromhex
-_PAGE, _PYMAVLINK = "the protocol page", "pymavlink 2.4.50"
+def _example(codec: str, frame: str, message: MavlinkMessage, /, source: str = "pymavlink", **more: Any) -> Example:
+    return Example(codec, bytes.fromhex(frame), message, source=source, **more)
+
+
+_PAGE = "the protocol page"
 _SETPOINT = control.SetPositionTargetLocalNed(
     vx=0.5, yaw_rate=-0.25, type_mask=0x5C7, target_system=1, target_component=1, coordinate_frame=8
 )
-_ATTITUDE = _hex("fd1c00000001011e0000e803000000000000000000000000003f0000000000000000000080bef8b5")
-_CELLS = (12000).to_bytes(2, "little") + b"\xff" * 18
+_HOLD = control.CommandLong(1.0, 4.0, command=176, target_system=1, target_component=1)
+_ATTITUDE = "fd1c00000001011e0000e803000000000000000000000000003f0000000000000000000080bef8b5"
+_CELLS = telemetry.BatteryStatus(voltages=b"\xe0\x2e" + b"\xff" * 18, current_battery=150, battery_remaining=80)
 EXAMPLES = (
-    Example(
+    _example(
         "rover",
-        _hex("fd0900000001010000000f0000000a03c10403ac7c"),
+        "fd0900000001010000000f0000000a03c10403ac7c",
         telemetry.MavlinkHeartbeat(15, 10, 3, 0xC1, 4, 3),
-        {"sensor/armed.value": 1.0},
-        source=_PAGE,
+        _PAGE,
+        shown={"sensor/armed.value": 1.0},
     ),
-    Example(
+    _example(
         "station",
-        _hex("fd0b000000ffbe450000000006fff401000000000146e7"),
+        "fd0b000000ffbe450000000006fff401000000000146e7",
         control.ManualControl(y=-250, z=500, target=1),
-        source=_PAGE,
+        _PAGE,
     ),
-    Example(
+    _example(
         "station",
-        _hex("fd20000000ffbe4c00000000803f000080400000000000000000000000000000000000000000b00001010e93"),
-        control.CommandLong(1.0, 4.0, command=176, target_system=1, target_component=1),
-        source=_PAGE,
+        "fd20000000ffbe4c00000000803f000080400000000000000000000000000000000000000000b00001010e93",
+        _HOLD,
+        _PAGE,
     ),
-    Example(
+    _example(
         "station",
-        _hex(
-            "fd35000000ffbe540000000000000000000000000000000000000000003f"
-            "000000000000000000000000000000000000000000000000000080bec705010108a165"
-        ),
+        "fd35000000ffbe540000000000000000000000000000000000000000003f"
+        "000000000000000000000000000000000000000000000000000080bec705010108a165",
         _SETPOINT,
         command=Drive(forward=0.5, turn=0.25),
-        source=_PYMAVLINK,
     ),
-    Example(
+    _example("rover", _ATTITUDE, telemetry.Attitude(1000, yaw=0.5, yawspeed=-0.25), shown={"motion.gyro": 0.25}),
+    _example(
         "rover",
-        _ATTITUDE,
-        telemetry.Attitude(1000, yaw=0.5, yawspeed=-0.25),
-        {"motion.gyro": 0.25},  # z, the last of three
-        source=_PYMAVLINK,
-    ),
-    Example(
-        "rover",
-        _hex("fd0c0000000101200000e803000000000040000040c06905"),
+        "fd0c0000000101200000e803000000000040000040c06905",
         telemetry.LocalPositionNed(1000, 2.0, -3.0),
-        {"pose.x": -3.0, "pose.y": 2.0, "pose.heading": math.pi / 2 - 0.5},
-        before=(_ATTITUDE,),
-        source=_PYMAVLINK,
+        shown={"pose.x": -3.0, "pose.y": 2.0, "pose.heading": math.pi / 2 - 0.5},
+        before=(bytes.fromhex(_ATTITUDE),),
     ),
-    Example(
+    _example(
         "rover",
-        _hex("fd24000000010193000000000000000000000000e02effffffffffffffffffffffffffffffffffff960000000050da9a"),
-        telemetry.BatteryStatus(voltages=_CELLS, current_battery=150, battery_remaining=80),
-        {"battery.voltage": 12.0, "battery.current": -1.5, "battery.level": 0.8},
-        source=_PYMAVLINK,
+        "fd24000000010193000000000000000000000000e02effffffffffffffffffffffffffffffffffff960000000050da9a",
+        _CELLS,
+        shown={"battery.voltage": 12.0, "battery.current": -1.5, "battery.level": 0.8},
     ),
-    Example(
+    _example(
         "rover",
-        _hex("fd0d0000000101840000000000001400bc02fa000000027241"),
+        "fd0d0000000101840000000000001400bc02fa000000027241",
         telemetry.DistanceSensor(0, 20, 700, 250, orientation=2),
-        {"sensor/distance_right.value": 2.5},
-        source=_PYMAVLINK,
+        shown={"sensor/distance_right.value": 2.5},
     ),
 )
 PROTOCOL = Protocol(

@@ -12,24 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from gateways.mavlink import numbers
 from gateways.mavlink.frames import LIMIT_BYTES, MavlinkFrame, frame_end, read_frame, write_frame
 from gateways.mavlink.messages import MavlinkMessage, control, telemetry
-from gateways.mavlink.numbers import (
-    ARDUPILOT,
-    ARMED,
-    AUTOPILOT,
-    BODY_FRD,
-    BODY_NED,
-    BODY_OFFSET_NED,
-    CUSTOM_MODE,
-    FORCE_ARM,
-    ROVER,
-    STATION,
-    Command,
-    Result,
-    RoverMode,
-    Severity,
-)
+from gateways.mavlink.numbers import FORCE_ARM, STATION, Command, Result, RoverMode, Severity
 from gateways.mavlink.texts import chunks_of
 from zbridge.protocol import ProtocolError, Simulation, Truth
 from zbridge.simulation import SimulatedRobot, serve
@@ -39,10 +25,12 @@ from zbridge.wire import FrameBuffer
 FASTEST_M_S, FASTEST_RAD_S = 1.0, 1.0
 """At full stick."""
 MOST_M_S = 2.0
+GIVEN_BACK = 32767
+"""An axis of a stick that is the RC receiver's again."""
 ACCELERATION_M_S2, COAST_M_S2 = 4.0, 1.5
 RADIUS_M = 0.25
 POINTS, RANGE_CM, NEAR_CM = 72, 800, 20
-HOME_LAT, HOME_LON = 473977420, 85455940
+HOME_LAT, HOME_LON, ALT_MM = 473977420, 85455940, 488000
 FULL_MV, EMPTY_MV, EMPTY_S = 12600.0, 10500.0, 7200.0
 STEADY_HZ = 20.0
 """Most often that a stream is sent."""
@@ -50,8 +38,6 @@ IGNORED = 0x1C0 | 0x07
 """Bits of ``type_mask`` that must be set: acceleration and position are not followed."""
 _VELOCITY, _YAW_RATE, _YAW = 0x08 | 0x10, 0x800, 0x400
 _STEERED = (RoverMode.MANUAL, RoverMode.ACRO, RoverMode.STEERING)
-_REFUSED_MODES = (RoverMode.INITIALISING,)
-_BEARINGS = np.radians(-180.0 + np.arange(POINTS) * 360.0 / POINTS)
 _M_PER_UNIT = 0.011131884502145034
 PARAMETERS = {
     "FS_GCS_ENABLE": 0.0,
@@ -89,7 +75,7 @@ class ArduRover(SimulatedRobot):
         self._gcs_at: float | None = None
         self._intervals: dict[int, float] = {}
         self._due: dict[int, float] = {}
-        self._speed = self._turn = 0.0
+        self.speed_m_s = self.turn_rad_s = 0.0
         self._silent = False
 
     # As its pilot, and its failures
@@ -113,7 +99,7 @@ class ArduRover(SimulatedRobot):
     def send(self, *messages: MavlinkMessage) -> None:
         """Send messages with the next answer, or step."""
         for message in messages:
-            self._out += write_frame(message, self._seq, self.system, AUTOPILOT)
+            self._out += write_frame(message, self._seq, self.system, numbers.AUTOPILOT)
             self._seq = (self._seq + 1) % 256
 
     # As a simulated robot
@@ -158,8 +144,8 @@ class ArduRover(SimulatedRobot):
         return out
 
     def _beat(self) -> None:
-        base = CUSTOM_MODE | (ARMED if self.armed else 0)
-        self.send(telemetry.MavlinkHeartbeat(int(self.mode), ROVER, ARDUPILOT, base, 4, 3))
+        base = numbers.CUSTOM_MODE | (numbers.ARMED if self.armed else 0)
+        self.send(telemetry.MavlinkHeartbeat(int(self.mode), numbers.ROVER, numbers.ARDUPILOT, base, 4, 3))
 
     # What it is sent
 
@@ -169,7 +155,8 @@ class ArduRover(SimulatedRobot):
             case telemetry.MavlinkHeartbeat(kind=kind) if kind == STATION and is_station:
                 self._gcs_at = self._now
             case control.ManualControl() if is_station:
-                self._gcs_at = self._override_at = self._now
+                self._gcs_at = self._now
+                self._override_at = -math.inf if GIVEN_BACK in (message.y, message.z) else self._now
                 self._override = (message.z / 1000, -message.y / 1000)
             case control.SetPositionTargetLocalNed() if self.mode is RoverMode.GUIDED:
                 self._follow(message)
@@ -190,7 +177,11 @@ class ArduRover(SimulatedRobot):
     def _follow(self, message: control.SetPositionTargetLocalNed) -> None:
         """Drive at a velocity. Backward only with a yaw or a yaw rate: else it would turn round, and drive ahead."""
         mask = message.type_mask
-        if message.coordinate_frame not in (BODY_NED, BODY_OFFSET_NED) or mask & IGNORED != IGNORED or mask & _VELOCITY:
+        if (
+            message.coordinate_frame not in (numbers.BODY_NED, numbers.BODY_OFFSET_NED)
+            or mask & IGNORED != IGNORED
+            or mask & _VELOCITY
+        ):
             return
         turns = not mask & _YAW_RATE
         forward = message.vx if turns or not mask & _YAW else abs(message.vx)
@@ -201,7 +192,7 @@ class ArduRover(SimulatedRobot):
         match message.command:
             case Command.DO_SET_MODE:
                 mode = int(message.param2)
-                if mode not in set(RoverMode) or mode in _REFUSED_MODES:
+                if mode not in set(RoverMode) or mode == RoverMode.INITIALISING:
                     return Result.FAILED
                 self.switch_mode(RoverMode(mode))
             case Command.ARM:
@@ -211,7 +202,7 @@ class ArduRover(SimulatedRobot):
             case Command.REQUEST_MESSAGE if int(message.param1) in _STREAMS:
                 self.send(_STREAMS[int(message.param1)](self))
             case Command.GET_HOME_POSITION:
-                self.send(self._home())
+                self.send(_STREAMS[242](self))
             case _:
                 return Result.UNSUPPORTED
         return Result.ACCEPTED
@@ -267,95 +258,79 @@ class ArduRover(SimulatedRobot):
 
     def _move(self, dt: float) -> None:
         """Accelerate, brake in GUIDED, coast where the throttle is off."""
-        speed, self._turn = self._wanted()
+        speed, self.turn_rad_s = self._wanted()
         coasts = not self.armed or self.mode is RoverMode.HOLD
         most = (COAST_M_S2 if coasts else ACCELERATION_M_S2) * dt
-        self._speed += max(-most, min(most, speed - self._speed))
-        self.body.step(self._speed, 0.0, self._turn, dt)
+        self.speed_m_s += max(-most, min(most, speed - self.speed_m_s))
+        self.body.step(self.speed_m_s, 0.0, self.turn_rad_s, dt)
         if self.body.blocked:
-            self._speed = 0.0
+            self.speed_m_s = 0.0
 
     # What it measures
 
     @property
-    def _ms(self) -> int:
+    def yaw(self) -> float:
+        """Clockwise from north, rad."""
+        return math.remainder(math.pi / 2 - self.body.heading, 2 * math.pi)
+
+    @property
+    def ms(self) -> int:
+        """Since it was switched on."""
         return round(self._now * 1000)
 
     @property
-    def _yaw(self) -> float:
-        return math.remainder(math.pi / 2 - self.body.heading, 2 * math.pi)
-
-    def _velocity(self) -> tuple[float, float]:
-        return self._speed * math.cos(self._yaw), self._speed * math.sin(self._yaw)
-
-    def _attitude(self) -> MavlinkMessage:
-        return telemetry.Attitude(self._ms, yaw=self._yaw, yawspeed=-self._turn)
-
-    def _local_position(self) -> MavlinkMessage:
-        north, east = self._velocity()
-        return telemetry.LocalPositionNed(self._ms, self.body.y, self.body.x, vx=north, vy=east)
-
-    def _global_position(self) -> MavlinkMessage:
-        lat = HOME_LAT + round(self.body.y / _M_PER_UNIT)
-        lon = HOME_LON + round(self.body.x / _M_PER_UNIT / math.cos(math.radians(HOME_LAT / 1e7)))
-        north, east = (round(speed * 100) for speed in self._velocity())
-        hdg = round(math.degrees(self._yaw) * 100) % 36000
-        return telemetry.GlobalPositionInt(self._ms, lat, lon, 488000, 0, north, east, hdg=hdg)
-
-    def _gps(self) -> MavlinkMessage:
-        return telemetry.GpsRawInt(self._ms * 1000, HOME_LAT, HOME_LON, 488000, fix_type=3, satellites_visible=12)
-
-    def _hud(self) -> MavlinkMessage:
-        heading = round(math.degrees(self._yaw)) % 360
-        return telemetry.VfrHud(abs(self._speed), abs(self._speed), heading=heading)
-
-    def _obstacles(self) -> MavlinkMessage:
-        """Measure around, clockwise from behind."""
-        metres = cast(self.body.x, self.body.y, self.body.heading - _BEARINGS, RANGE_CM / 100 + 0.01)
-        cm = np.rint(metres * 100).astype("<u2")
-        return telemetry.ObstacleDistance(
-            self._ms * 1000, cm.tobytes(), NEAR_CM, RANGE_CM, 0, 5, 5.0, angle_offset=-180.0, frame=BODY_FRD
-        )
-
-    def _distance(self) -> MavlinkMessage:
-        (ahead,) = cast(self.body.x, self.body.y, np.array([self.body.heading]), RANGE_CM / 100)
-        return telemetry.DistanceSensor(self._ms, NEAR_CM, RANGE_CM, round(ahead * 100))
-
-    def _millivolts(self) -> int:
-        return round(FULL_MV - (FULL_MV - EMPTY_MV) * min(1.0, self._now / EMPTY_S))
-
-    def _percent(self) -> int:
+    def percent(self) -> int:
+        """What is left in its battery."""
         return round(100 * (1 - min(1.0, self._now / EMPTY_S)))
 
-    def _system(self) -> MavlinkMessage:
-        return telemetry.SysStatus(
-            voltage_battery=self._millivolts(), current_battery=150, battery_remaining=self._percent()
-        )
-
-    def _battery(self) -> MavlinkMessage:
-        cells = np.array([self._millivolts(), *(9 * [65535])], "<u2").tobytes()
-        return telemetry.BatteryStatus(voltages=cells, current_battery=150, battery_remaining=self._percent())
-
-    def _version(self) -> MavlinkMessage:
-        return control.AutopilotVersion(uid=0x1234, flight_sw_version=4 << 24 | 5 << 16 | 1 << 8 | 255)
-
-    def _home(self) -> MavlinkMessage:
-        return telemetry.HomePosition(HOME_LAT, HOME_LON, 488000)
+    @property
+    def millivolts(self) -> int:
+        """Of its battery."""
+        return round(EMPTY_MV + (FULL_MV - EMPTY_MV) * self.percent / 100)
 
 
-_STREAMS: dict[int, Callable[[ArduRover], Any]] = {
-    1: ArduRover._system,
-    24: ArduRover._gps,
-    30: ArduRover._attitude,
-    32: ArduRover._local_position,
-    33: ArduRover._global_position,
-    74: ArduRover._hud,
-    132: ArduRover._distance,
-    147: ArduRover._battery,
-    148: ArduRover._version,
-    242: ArduRover._home,
-    330: ArduRover._obstacles,
+def _global_position(rover: ArduRover) -> MavlinkMessage:
+    lat = HOME_LAT + round(rover.body.y / _M_PER_UNIT)
+    lon = HOME_LON + round(rover.body.x / _M_PER_UNIT / math.cos(math.radians(HOME_LAT / 1e7)))
+    hdg = round(math.degrees(rover.yaw) * 100) % 36000
+    return telemetry.GlobalPositionInt(rover.ms, lat, lon, ALT_MM, hdg=hdg)
+
+
+def _ranges_cm(rover: ArduRover, clockwise: Any) -> Any:
+    """Measure along angles from ahead, rad; one more than the range where there is nothing."""
+    metres = cast(rover.body.x, rover.body.y, rover.body.heading - clockwise, RANGE_CM / 100 + 0.01)
+    return np.rint(metres * 100).astype("<u2")
+
+
+def _obstacles(rover: ArduRover) -> MavlinkMessage:
+    around = _ranges_cm(rover, np.radians(-180.0 + np.arange(POINTS) * 360.0 / POINTS)).tobytes()
+    limits, step = (NEAR_CM, RANGE_CM), 360.0 / POINTS
+    return telemetry.ObstacleDistance(
+        rover.ms * 1000, around, *limits, 0, round(step), step, angle_offset=-180.0, frame=numbers.BODY_FRD
+    )
+
+
+def _battery(rover: ArduRover) -> MavlinkMessage:
+    cells = np.array([rover.millivolts, *(9 * [65535])], "<u2").tobytes()
+    return telemetry.BatteryStatus(voltages=cells, current_battery=150, battery_remaining=rover.percent)
+
+
+_STREAMS: dict[int, Callable[[ArduRover], MavlinkMessage]] = {
+    1: lambda rover: telemetry.SysStatus(
+        voltage_battery=rover.millivolts, current_battery=150, battery_remaining=rover.percent
+    ),
+    24: lambda rover: telemetry.GpsRawInt(rover.ms * 1000, HOME_LAT, HOME_LON, ALT_MM, fix_type=3),
+    30: lambda rover: telemetry.Attitude(rover.ms, yaw=rover.yaw, yawspeed=-rover.turn_rad_s),
+    32: lambda rover: telemetry.LocalPositionNed(rover.ms, rover.body.y, rover.body.x),
+    33: _global_position,
+    74: lambda rover: telemetry.VfrHud(groundspeed=abs(rover.speed_m_s)),
+    132: lambda rover: telemetry.DistanceSensor(rover.ms, NEAR_CM, RANGE_CM, int(_ranges_cm(rover, np.zeros(1))[0])),
+    147: _battery,
+    148: lambda rover: control.AutopilotVersion(uid=0x1234, flight_sw_version=4 << 24 | 5 << 16 | 1 << 8 | 255),
+    242: lambda rover: telemetry.HomePosition(HOME_LAT, HOME_LON, ALT_MM),
+    330: _obstacles,
 }
+"""What it measures, or knows of itself, by the id of the message."""
 
 
 async def simulate(simulation: Simulation) -> None:

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 from gateways.mavlink.frames import MavlinkFrame, read_frame
 from gateways.mavlink.messages import MavlinkMessage
-from gateways.mavlink.messages.control import AutopilotVersion, CommandAck, CommandLong, ParamValue
+from gateways.mavlink.messages.control import AutopilotVersion, CommandAck, CommandLong, ManualControl, ParamValue
 from gateways.mavlink.messages.telemetry import MavlinkHeartbeat
 from gateways.mavlink.numbers import (
     ARDUPILOT,
@@ -38,6 +38,8 @@ HANDSHAKE_S = 10.0
 BEATS = 2
 """HEARTBEATs of a vehicle that was not configured: an ArduPilot may send its first one with a wrong id."""
 STOP_AGAIN_S = 0.2
+GIVE_BACK = 32767
+"""The value of an axis that gives it back to the RC receiver: else the last stick would count for 3 s more."""
 MOTION = "motion"
 """The slot of motion and stops."""
 _MODE = "mode"
@@ -58,6 +60,7 @@ class RoverSession(MavlinkSession[Any]):
         "requests": RoverRequests,
         "_beats": dict[int, int],
         "_uid": tuple[int, bytes] | None,
+        "_overrides": bool,
     }
 
     def __init__(self, options: RoverOptions, helm: Helm) -> None:
@@ -67,6 +70,8 @@ class RoverSession(MavlinkSession[Any]):
         self.requests = RoverRequests(self, options)
         self._beats: Counter[int] = Counter()
         self._uid: tuple[int, bytes] | None = None
+        self._overrides = False
+        """Whether a stick of ours may hold the RC receiver's off."""
         self._now = -math.inf
         self._lives = False
         """Whether the rover's HEARTBEAT is among what was just read."""
@@ -166,6 +171,9 @@ class RoverSession(MavlinkSession[Any]):
             self.outbox.clear(_MODE)
         if not self.helm.ours or state is HelmState.HELD:
             self.outbox.clear(MOTION)
+            if self._overrides and not self.over:
+                self._overrides = False
+                self.send_first(ManualControl(y=GIVE_BACK, z=GIVE_BACK, target=self.vehicle))
         self._warn()
 
     def _warn(self) -> None:
@@ -192,6 +200,7 @@ class RoverSession(MavlinkSession[Any]):
             frames = tuple(map(self.encode, asks))
             self.outbox.set(_MODE, frames, -math.inf, period_s=AGAIN_S, until=until)  # before the motion
             self.outbox.clear(MOTION)  # a stop that is repeated
+        self._overrides = isinstance(message, ManualControl)
         self.outbox.set(MOTION, (self.encode(message),), now, period_s=period_s)
 
     def halt(self, frames: tuple[bytes, ...], now: float, until: float) -> None:

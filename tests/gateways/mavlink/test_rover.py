@@ -360,11 +360,26 @@ def test_a_pilot_who_takes_the_rover_keeps_it_until_the_driver_sent_neutral(how:
     scene.run(5.0)
     assert (rover.mode, modes(scene, since)) == (pilots, [])
     assert sent(scene, ManualControl, since) + sent(scene, SetPositionTargetLocalNed, since) == []
+    assert rover.speed_m_s == pytest.approx(0.4)  # our last stick counts no more
     scene.drive(0.0)
     scene.run(0.5)
     assert rover.mode is pilots
     drive(scene, 0.5)
     assert rover.mode is scene.robot.helm.driving
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_our_last_stick_does_not_hold_the_pilots_off(held: bool) -> None:
+    scene = begin(drive="manual")
+    drive(scene, 0.5)
+    if held:
+        scene.stop()
+        scene.run(0.5)
+    scene.simulated.stick = (-0.4, 0.0)
+    scene.simulated.switch_mode(RoverMode.STEERING)
+    scene.run(0.5)
+    assert sent(scene, ManualControl)[-1] == ManualControl(y=32767, z=32767, target=1)
+    assert scene.simulated.speed_m_s == pytest.approx(-0.4)
 
 
 def test_a_pilot_may_take_a_rover_that_we_hold() -> None:

@@ -373,21 +373,19 @@ def _begin(session: Session[Any], reason: str, now: float) -> None:
 
 def _agree(session: Session[Any], reason: str, now: float) -> None:
     session.lift_limit()
-    keep_alive = session.keep_alive
-    if keep_alive is not None:
+    if (keep_alive := session.keep_alive) is not None:
         frames = (session.encode(keep_alive.message),)
         session.outbox.set(KEEP_ALIVE, frames, -math.inf, period_s=keep_alive.period_s)
     session.silence.begin()
 
 
 def _leave(session: Session[Any], reason: str, now: float) -> None:
-    session.reason, session.busy, session.doubts, session.warnings = reason, None, (), ()
+    session.reason, session.busy, session.doubts = reason, None, ()
     session._limit_at = now + LINGER_S
 
 
 def _end(session: Session[Any], reason: str, now: float) -> None:
-    session.reason, session.busy = session.reason or reason, None
-    session.doubts = session.warnings = ()
+    session.reason, session.busy, session.doubts = session.reason or reason, None, ()
 
 
 _ACTIONS: dict[SessionEvent, Callable[[Session[Any], str, float], None]] = {

@@ -53,6 +53,7 @@ class Helm(Kept):
         "_shown_at": float,
         "_acknowledged": bool,
         "_judged": bool,
+        "_yields": bool,
     }
 
     def __init__(self, driving: RoverMode, *, arms: bool) -> None:
@@ -65,7 +66,7 @@ class Helm(Kept):
         """A stop that the rover did not confirm."""
         self._why = self._said = ""
         self._since = self._shown_at = -math.inf
-        self._acknowledged = self._judged = False
+        self._acknowledged = self._judged = self._yields = False
 
     def __repr__(self) -> str:
         return f"<Helm {self.state.value}, mode {self.mode_name}, {'armed' if self.armed else 'disarmed'}>"
@@ -106,10 +107,11 @@ class Helm(Kept):
             self.state = HelmState.OTHERS
         return self.state in (HelmState.ASKED, HelmState.DRIVING)
 
-    def stop(self, now: float) -> None:
-        """Note that HOLD is asked for."""
+    def stop(self, now: float, *, ordered: bool) -> None:
+        """Note that HOLD is asked for. ordered: by a person, so also against a pilot who takes the rover meanwhile."""
         self.state, self._since = HelmState.STOPPING, now
         self._acknowledged = self._judged = False
+        self._yields = not ordered and self.mode == self.driving
 
     # What the rover says
 
@@ -125,6 +127,8 @@ class Helm(Kept):
             self.state = HelmState.OTHERS
         elif state is HelmState.STOPPING and self._acknowledged and mode == RoverMode.HOLD:
             self.state, self.warning = HelmState.HELD, None
+        elif state is HelmState.STOPPING and self._yields and mode not in (self.driving, RoverMode.HOLD):
+            self.state = HelmState.OTHERS
         elif state is HelmState.STOPPING and now >= self._since + STOP_S:
             self._judge()
 

@@ -203,9 +203,9 @@ class RoverSession(MavlinkSession[Any]):
         self._overrides = isinstance(message, ManualControl)
         self.outbox.set(MOTION, (self.encode(message),), now, period_s=period_s)
 
-    def halt(self, frames: tuple[bytes, ...], now: float, until: float) -> None:
+    def halt(self, frames: tuple[bytes, ...], now: float, until: float, *, ordered: bool) -> None:
         """Send a stop, and repeat it until it is confirmed."""
-        self.helm.stop(now)
+        self.helm.stop(now, ordered=ordered)
         self.outbox.clear(_MODE)
         until = min(until, now + STOP_S)
         self.outbox.set(MOTION, frames, now, period_s=STOP_AGAIN_S, until=until, urgent=True)

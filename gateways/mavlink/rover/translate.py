@@ -63,12 +63,12 @@ class RoverRobot(RobotSide):
         return Outcome(left_out="; ".join(left_out) or None)
 
     def stop(self, now: float, until: float) -> None:
-        self._session.halt(self._stop(), now, until)
+        self._session.halt(self._stop(), now, until, ordered=True)
 
     def rest(self, now: float, until: float) -> None:
         """Stop in our own mode only: the rover may be its RC pilot's, or on a mission. One that holds is left so."""
         if self.helm.ours and self.helm.state is not HelmState.HELD:
-            self.stop(now, until)
+            self._session.halt(self._stop(), now, until, ordered=False)
 
     def stop_frames(self) -> tuple[bytes, ...]:
         """Return the frames of a stop while the rover is in our mode: a gateway that dies takes it from nobody."""

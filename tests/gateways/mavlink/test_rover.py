@@ -297,7 +297,7 @@ def test_a_heartbeat_from_before_the_stop_does_not_confirm_it() -> None:
     helm = Helm(RoverMode.GUIDED, arms=True)
     helm.show(4, armed=True, now=0.0)
     helm.engage(0.1)
-    helm.stop(0.2)
+    helm.stop(0.2, ordered=True)
     helm.show(4, armed=True, now=0.25)  # sent before GUIDED was obeyed
     assert helm.state is HelmState.STOPPING
     helm.answer("mode", accepted=True)  # of GUIDED
@@ -366,6 +366,18 @@ def test_a_pilot_who_takes_the_rover_keeps_it_until_the_driver_sent_neutral(how:
     assert rover.mode is pilots
     drive(scene, 0.5)
     assert rover.mode is scene.robot.helm.driving
+
+
+@pytest.mark.parametrize("ordered", [False, True])
+def test_a_pilot_who_takes_the_rover_during_a_stop_keeps_it_unless_the_stop_is_an_order(ordered: bool) -> None:
+    scene = begin(rover := DeafRover())
+    drive(scene, 0.5)
+    rover.deaf = {Command.DO_SET_MODE: 1}
+    scene.stop() if ordered else scene.rest()
+    scene.run(0.1)
+    rover.switch_mode(RoverMode.MANUAL)
+    scene.run(2.0)
+    assert rover.mode is (RoverMode.HOLD if ordered else RoverMode.MANUAL)
 
 
 @pytest.mark.parametrize("held", [False, True])

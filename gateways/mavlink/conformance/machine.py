@@ -31,6 +31,9 @@ _PARAMETERS = {
 }
 _MOST_SENDS, _QUICKEST_S = 4, 0.9
 """Of a command without ACK: how often it is sent, and the least time for that many (0.5 s apart: 1.5 s)."""
+_GIVEN_BACK = 32767
+_ASKED_S = 2.0
+"""How long after a request for the mode to drive in a setpoint may come before HEARTBEAT shows it."""
 _EPISODE_S = 3.0
 """A command that was last sent longer ago begins anew."""
 
@@ -221,7 +224,7 @@ class StationRules:
         if not int(fields["param1"]) & 1:
             self._violate("DO_SET_MODE without the custom mode's bit")
         if mode == HOLD:
-            if not self._zeroed:
+            if not self._zeroed and not (self._expected.drive == "manual" and self._ordered()):
                 self._violate("HOLD without a zero setpoint or a neutral stick before it")
             if self._shown[0] == HOLD and held_s > self._expected.hold_s and not self._ordered():
                 self._violate(f"HOLD {held_s:.1f} s after HEARTBEAT showed it")
@@ -268,8 +271,15 @@ class StationRules:
             self._violate(f"a setpoint of {values}")
         self._move("a setpoint", any(values))
 
+    def _asking(self) -> bool:
+        """Whether the mode to drive in was asked for a moment ago, and HEARTBEAT has shown nothing new since."""
+        request = self._requests.get((SET_MODE, int(self._mode)))
+        return request is not None and self._shown_s < request.last_s and self._awake_s - request.last_s <= _ASKED_S
+
     def _judge_stick(self, fields: dict[str, Any]) -> None:
         values = fields["y"], fields["z"]
+        if values == (_GIVEN_BACK, _GIVEN_BACK) and self._expected.drive == "manual":
+            return  # to the RC receiver
         if not all(-1000 <= value <= 1000 for value in values):
             self._violate(f"a stick of y {values[0]}, z {values[1]}")
         self._stick(any(values))
@@ -294,5 +304,7 @@ class StationRules:
         mode, armed = self._shown
         if self._stopped:
             self._violate(f"{what} with motion after a stop, before the mode was asked for again")
+        elif what == "a setpoint" and self._asking():  # it is ignored until the mode is shown
+            return
         elif self._awake_s - self._shown_s > self._expected.reaction_s and (mode != self._mode or not armed):
             self._violate(f"{what} with motion in mode {mode}{'' if armed else ', disarmed'}")

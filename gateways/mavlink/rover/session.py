@@ -32,11 +32,13 @@ from gateways.mavlink.rover.helm import STOP_S, Helm, HelmState
 from gateways.mavlink.rover.options import RoverOptions
 from gateways.mavlink.rover.requests import AGAIN_S, TRIES, RoverRequests, command_long, failsafe_warnings
 from gateways.mavlink.session import MavlinkSession
-from zbridge.protocol import KeepAlive, Limits, Role, State
+from zbridge.protocol import KEEP_ALIVE, KeepAlive, Limits, Role, State
 
 HANDSHAKE_S = 10.0
 BEATS = 2
 """HEARTBEATs of a vehicle that was not configured: an ArduPilot may send its first one with a wrong id."""
+REPEAT_S = {"guided": 0.2, "manual": 0.1}
+"""Seconds after which motion is repeated."""
 STOP_AGAIN_S = 0.2
 GIVE_BACK = 32767
 """The value of an axis that gives it back to the RC receiver: else the last stick would count for 3 s more."""
@@ -61,6 +63,7 @@ class RoverSession(MavlinkSession[Any]):
         "_beats": dict[int, int],
         "_uid": tuple[int, bytes] | None,
         "_overrides": bool,
+        "_motion": bytes,
     }
 
     def __init__(self, options: RoverOptions, helm: Helm) -> None:
@@ -70,11 +73,18 @@ class RoverSession(MavlinkSession[Any]):
         self.requests = RoverRequests(self, options)
         self._beats: Counter[int] = Counter()
         self._uid: tuple[int, bytes] | None = None
+        self._motion = b""
+        """The motion that is wanted; it is sent once the rover shows our mode."""
         self._overrides = False
         """Whether a stick of ours may hold the RC receiver's off."""
         self._now = -math.inf
         self._lives = False
         """Whether the rover's HEARTBEAT is among what was just read."""
+
+    def opened(self, now: float) -> None:
+        """Speak first by datagrams: a vehicle does not know yet that we are there."""
+        if self.transport == "udp":
+            self.outbox.set(KEEP_ALIVE, (self.encode(_ALIVE),), now, period_s=self.keep_alive.period_s)
 
     # Messages
 
@@ -169,6 +179,8 @@ class RoverSession(MavlinkSession[Any]):
         state = self.helm.state
         if state is not HelmState.ASKED:
             self.outbox.clear(_MODE)
+        if state is HelmState.DRIVING and self._motion and not self.outbox.is_set(MOTION):
+            self._send_motion(self._now)
         if not self.helm.ours or state is HelmState.HELD:
             self.outbox.clear(MOTION)
             if self._overrides and not self.over:
@@ -183,14 +195,15 @@ class RoverSession(MavlinkSession[Any]):
 
     # Commands
 
-    def drive(self, message: MavlinkMessage, now: float, *, moving: bool, period_s: float) -> None:
+    def drive(self, message: MavlinkMessage, now: float, *, moving: bool) -> None:
         """Send motion and repeat it, behind a request for our mode where needed; raise NotReady.
 
         Neutral goes only into a mode that is ours.
         """
         if not moving:
+            self._motion = b""
             if self.helm.release():
-                self.outbox.set(MOTION, (self.encode(message),), now, period_s=period_s)
+                self.outbox.set(MOTION, (self.encode(message),), now, period_s=REPEAT_S[self.options.drive])
             return
         if self.helm.engage(now):
             asks = [self._mode(self.helm.driving)]
@@ -200,12 +213,23 @@ class RoverSession(MavlinkSession[Any]):
             frames = tuple(map(self.encode, asks))
             self.outbox.set(_MODE, frames, -math.inf, period_s=AGAIN_S, until=until)  # before the motion
             self.outbox.clear(MOTION)  # a stop that is repeated
-        self._overrides = isinstance(message, ManualControl)
-        self.outbox.set(MOTION, (self.encode(message),), now, period_s=period_s)
+        self._motion = self.encode(message)
+        if self.helm.state is HelmState.DRIVING or self.options.drive == "guided":
+            self._send_motion(now)
+
+    def _send_motion(self, now: float) -> None:
+        """Send the newest motion, and repeat it.
+
+        A stick waits until the rover shows our mode: in the mode of its RC pilot it would be obeyed too. A setpoint is
+        ignored outside GUIDED.
+        """
+        self._overrides = self.options.drive == "manual"
+        self.outbox.set(MOTION, (self._motion,), now, period_s=REPEAT_S[self.options.drive])
 
     def halt(self, frames: tuple[bytes, ...], now: float, until: float, *, ordered: bool) -> None:
         """Send a stop, and repeat it until it is confirmed."""
         self.helm.stop(now, ordered=ordered)
+        self._motion = b""
         self.outbox.clear(_MODE)
         until = min(until, now + STOP_S)
         self.outbox.set(MOTION, frames, now, period_s=STOP_AGAIN_S, until=until, urgent=True)

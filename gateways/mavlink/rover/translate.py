@@ -20,8 +20,6 @@ from zbridge.fleet.messages import Drive, FleetMessage
 from zbridge.fleet.topics import Topic
 from zbridge.protocol import Metrics, NotReady, Outcome, RobotSide, State, Translate, Unsupported
 
-SETPOINT_S, STICK_S = 0.2, 0.1
-"""Seconds after which motion is repeated."""
 FULL_STICK = 1000
 _SIDEWAYS = "left: a rover does not move sideways"
 
@@ -53,9 +51,8 @@ class RoverRobot(RobotSide):
             raise Unsupported("a rover takes drives only")
         if command.left and not (command.forward or command.turn):
             raise Unsupported(_SIDEWAYS)
-        period_s = STICK_S if self.options.drive == "manual" else SETPOINT_S
         moving = bool(command.forward or command.turn)
-        self._session.drive(self._motion(command.forward, command.turn), now, moving=moving, period_s=period_s)
+        self._session.drive(self._motion(command.forward, command.turn), now, moving=moving)
         if command.forward:
             self._telemetry.backward = command.forward < 0
         left_out = [_SIDEWAYS] if command.left else []

@@ -1,8 +1,8 @@
 """Targets of the sessions, in both roles, with the translation behind them: what a peer may send at any time.
 
 An input is a byte that chooses the cuts and one that chooses the pauses, then the stream. It is read three times: whole
-and cut, at one moment, which must give the same messages and the same end; and with pauses, timers, datagrams and all
-that is written, which may raise nothing.
+and cut, at one moment, which must give the same messages (but for those of unknown ids) and the same end; and with
+pauses, timers, datagrams and all that is written, which may raise nothing.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Any
 import msgspec
 
 from gateways.alf import PROTOCOL as ALF
+from gateways.mavlink import PROTOCOL as MAVLINK
 from gateways.ros2 import PROTOCOL as ROS2
 from gateways.tcpudp import PROTOCOL as TCPUDP
 from gateways.wc2ec import PROTOCOL as WC2EC
@@ -61,7 +62,8 @@ def converse(make: Make, data: bytes) -> None:
 def _at_once(make: Make, reads: Iterable[bytes]) -> list[Any]:
     session, _, _ = make()
     session.open(0.0)
-    heard = [comparable(message) for read in reads for message in session.receive(read, 0.0)]
+    told = (message for read in reads for message in session.receive(read, 0.0))
+    heard = [comparable(message) for message in told if getattr(message, "message", message) is not None]
     return [heard, session.state, (session.reason or "").partition(":")[0]]  # then it may quote bytes of the read
 
 
@@ -170,6 +172,8 @@ def targets() -> Iterator[Target]:
     yield _target(
         "session-ros2-robot", _robot(ROS2), ("gateways/ros2/session.py", "gateways/ros2/graph.py"), _samples()
     )
+    for name, make, writer in _MAVLINK:
+        yield _target(f"session-mavlink-{name}", make, _MAVLINK_COVERS, _mavlink_streams(writer))
     yield _target("session-exchange-robot", _khepera(), ("zbridge/protocol/exchange.py", "zbridge/wire/lines.py"), [
         b"b,5,2\ne,1,-1\nn,1,2,3,4,5,6,7,8\nh,100,-100\n"
     ])  # fmt: skip
@@ -227,6 +231,18 @@ def _samples() -> list[bytes]:
     return made
 
 
+def _mavlink_streams(sender: tuple[int, int]) -> list[bytes]:
+    """Write what the link of a rover, or of a ground station, brings: frames of every message, and noise."""
+    from gateways.mavlink.frames import write_frame
+    from gateways.mavlink.messages import MESSAGES
+
+    frames = [write_frame(spec.message(), number, *sender) for number, spec in enumerate(MESSAGES.values())]
+    beats = bytes.fromhex("fd0900000001010000000f0000000a03c10403ac7c") * 3
+    ordered = "fd20000000ffbe4c00000000803f000080400000000000000000000000000000000000000000b00001010e93"
+    stick = bytes.fromhex("fd0b000000ffbe450000000006fff401000000000146e7")
+    return [beats + b"".join(frames[:17]), beats + b"".join(frames[17:]), bytes.fromhex(ordered) + stick + b"\xfd" * 20]
+
+
 GOLDEN: dict[str, Any] = {"alf": alf, "tcpudp": tcpudp, "wc2ec": wc2ec}
 _ALF = ("gateways/alf/session.py", "gateways/alf/translate.py", "gateways/alf/hq.py")
 _WC2EC = ("gateways/wc2ec/session.py", "gateways/wc2ec/devices.py", "gateways/wc2ec/translate.py")
@@ -249,3 +265,14 @@ ROLES: tuple[tuple[str, Make, tuple[str, ...], bytes], ...] = (
     ("session-wc2ec-hq-draft", _listener(WC2EC, dialect="draft", devices=[{"name": "light0", "number": 0}]), _WC2EC,
      b""),
 )  # fmt: skip
+_MAVLINK_COVERS = (
+    "gateways/mavlink/frames.py",
+    "gateways/mavlink/rover/session.py",
+    "gateways/mavlink/station/session.py",
+    "gateways/mavlink/station/hq.py",
+)
+_MAVLINK: tuple[tuple[str, Make, tuple[int, int]], ...] = (
+    ("rover", _robot(MAVLINK, arm="drive"), (1, 1)),
+    ("rover-manual", _robot(MAVLINK, arm="drive", drive="manual", vehicle_id=1), (1, 1)),
+    ("station", _listener(MAVLINK, system_id=1), (255, 190)),
+)

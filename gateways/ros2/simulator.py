@@ -15,6 +15,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from gateways.ros2.messages import TWIST, TWIST_STAMPED, LinkEvent
@@ -254,7 +255,7 @@ def _step(
     machine: RosMachine, session: NodeRole, conversation: Conversation, report: Callable[[Truth], None], steps: int
 ) -> None:
     machine.step(STEP_S)
-    report(machine.truth())
+    report(msgspec.structs.replace(machine.truth(), lived_s=steps * STEP_S))
     if session.state is not State.ESTABLISHED:
         return
     seconds, nanoseconds = divmod(time.time_ns(), _NS_PER_S)

@@ -65,6 +65,7 @@ async def test_a_client_is_greeted_and_answered_and_a_second_one_is_closed() -> 
             each.close()
             await each.wait_closed()
     assert 0.05 < truths[-1].x < 1.0
+    assert truths[-1].lived_s == truths[-1].x
 
 
 @pytest.mark.parametrize("last", [b"what?", b"bye"])

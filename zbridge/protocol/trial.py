@@ -34,7 +34,9 @@ class Truth(msgspec.Struct, frozen=True):
     x, y, heading: metres and radians in the room, counter-clockwise (REP 103). wheels_m_s: the speed of each side over
     ground, left first; empty: it has no such sides. neutral: whether its motors are told to stand still.
     wraps: how often one of its counters has wrapped around. watchdog: whether its watchdog has stopped it, because a
-    keep-alive or a request was missing.
+    keep-alive or a request was missing. lived_s: seconds that the robot itself has lived, which are fewer than the
+    kit's after a pause of the process, and pass faster while it catches up; None: it lives by the kit's clock.
+    ``zbridge.simulation`` sets it.
     """
 
     x: float
@@ -44,6 +46,7 @@ class Truth(msgspec.Struct, frozen=True):
     neutral: bool = False
     wraps: int = 0
     watchdog: bool = False
+    lived_s: float | None = None
 
 
 class Simulation(msgspec.Struct, frozen=True):

@@ -9,6 +9,8 @@ from __future__ import annotations
 import asyncio
 from abc import ABC, abstractmethod
 
+import msgspec
+
 from zbridge.errors import ConfigError, ProtocolError
 from zbridge.log import Log
 from zbridge.protocol.address import Address
@@ -87,11 +89,13 @@ async def serve(simulation: Simulation, robot: SimulatedRobot) -> None:
 
 async def _live(simulation: Simulation, robot: SimulatedRobot, writers: set[asyncio.StreamWriter]) -> None:
     clock = asyncio.get_running_loop().time
-    lived = clock()
+    now, lived_s = clock(), 0.0
     while True:
         await asyncio.sleep(STEP_S)
-        before, lived = lived, clock()
-        sent = robot.step(min(lived - before, _MOST_STEP_S))
-        simulation.report(robot.truth())
+        before, now = now, clock()
+        dt = min(now - before, _MOST_STEP_S)
+        sent = robot.step(dt)
+        lived_s += dt
+        simulation.report(msgspec.structs.replace(robot.truth(), lived_s=lived_s))
         for writer in writers:
             writer.write(sent)

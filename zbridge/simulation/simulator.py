@@ -14,6 +14,8 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, Generic, TypeVar
 
+import msgspec
+
 from zbridge.errors import EncodeError, Refused
 from zbridge.log import Log
 from zbridge.protocol.plugin import Simulation, Truth
@@ -128,7 +130,7 @@ class Simulator(ABC, Generic[M]):
         self.step(steps)
         truth = self.truth()
         if truth is not None:
-            report(truth)
+            report(msgspec.structs.replace(truth, lived_s=steps * STEP_S))
 
     def _admit(self, link: Link, name: str) -> Conversation | None:
         session = self.session(link.peer, name)

@@ -84,7 +84,7 @@ async def leg(
     else:
         stage.robot.command(topics.CMD_DRIVE, Drive(), stage.now())
         await stage.watch(stand_s)
-    steady_m_s, steady_rad_s = _rates(steady)
+    steady_m_s, steady_rad_s = rates(steady)
     after, true = stage.last_pose, stage.truth
     return Leg(
         seconds=ended - begun,
@@ -99,27 +99,30 @@ async def leg(
     )
 
 
-def _rates(truths: Sequence[tuple[float, Truth]]) -> tuple[float, float]:
-    """Return the usual speed ahead, m/s, and the usual turn rate, rad/s, over :data:`STEADY_S`."""
+def rates(truths: Sequence[tuple[float, Truth]]) -> tuple[float, float]:
+    """Return the usual speed ahead, m/s, and the usual turn rate, rad/s, over :data:`STEADY_S` of the robot's time.
+
+    truths: each with the time when it was reported, which counts only if the robot does not say its own.
+    """
+    times = [at if truth.lived_s is None else truth.lived_s for at, truth in truths]
     speeds: list[float] = []
-    rates: list[float] = []
+    turns: list[float] = []
     first = 0
-    for at, truth in truths:
-        while truths[first][0] < at - STEADY_S:
+    for at, (_, truth) in zip(times, truths, strict=True):
+        while times[first] < at - STEADY_S:
             first += 1
-        seconds = at - truths[first][0]
+        seconds = at - times[first]
         if seconds >= STEADY_S / 2:
             way = Way.between(truths[first][1], truth)
             speeds.append(math.copysign(way.far_m, way.ahead_m) / seconds)
-            rates.append(way.turned_rad / seconds)
-    return _usual(speeds), _usual(rates)
+            turns.append(way.turned_rad / seconds)
+    return _usual(speeds), _usual(turns)
 
 
 def _usual(values: list[float]) -> float:
     """Return the median of the values that are no less than half of the upper quartile.
 
-    On a busy machine a drive may come late, and the robot stops meanwhile; a simulator that was late catches up, and
-    seems far too fast for a moment.
+    On a busy machine a drive may come late, and the robot stops meanwhile.
     """
     if not values:
         return 0.0

@@ -13,12 +13,13 @@ import pytest
 class _Jumping(selectors.DefaultSelector):
     """Moves the clock of its loop forward instead of sleeping."""
 
-    def __init__(self) -> None:
+    def __init__(self, pass_s: float) -> None:
         super().__init__()
-        self.now = 1000.0
+        self.now, self._pass_s = 1000.0, pass_s
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         ready = super().select(0)
+        self.now += self._pass_s
         if ready or timeout == 0:
             return ready
         if timeout is None:
@@ -28,10 +29,14 @@ class _Jumping(selectors.DefaultSelector):
 
 
 class JumpingLoop(asyncio.SelectorEventLoop):
-    """An event loop for code that uses nothing but timers and futures."""
+    """An event loop for code that uses nothing but timers and futures, and for both ends of TCP on loopback.
 
-    def __init__(self) -> None:
-        self._jumping = _Jumping()
+    What is written to loopback is there for the next pass; no other process and no thread may be waited for. pass_s:
+    seconds that each pass takes; with some, code that sleeps until a time has come gets there in spite of rounding.
+    """
+
+    def __init__(self, pass_s: float = 0.0) -> None:
+        self._jumping = _Jumping(pass_s)
         super().__init__(self._jumping)
 
     def time(self) -> float:

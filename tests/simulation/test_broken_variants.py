@@ -5,10 +5,10 @@ from __future__ import annotations
 import asyncio
 import math
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Coroutine, Iterable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import pytest
@@ -21,6 +21,7 @@ import arcos.translate
 from arcos import PROTOCOL
 from arcos.messages import PACKETS, Command, Do, Report, Setting
 
+from tests.clock import JumpingLoop
 from zbridge.errors import NotReady
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, Motion, Pose, Scan
@@ -38,6 +39,7 @@ from zbridge.simulation.checks.stops import check_stops
 from zbridge.simulation.checks.values import check_values
 from zbridge.wire import Packets
 
+T = TypeVar("T")
 Robot, Session, Simulated = arcos.translate.ArcosRobot, arcos.session.ArcosSession, arcos.simulator.Arcos
 broken = partial(msgspec.structs.replace, PROTOCOL)
 
@@ -97,7 +99,13 @@ def scaled(factor: float, *names: str) -> Callable[[Any], Any]:
 mirrored_pose = shows(Pose, scaled(-1.0, "y", "heading"))
 mirrored_drive = drives(scaled(-1.0, "turn"))
 
-# Scenes in real time
+# Scenes with a simulated robot on loopback
+
+
+def at_once(scene: Coroutine[Any, Any, T]) -> T:
+    """Run a scene on a clock that jumps, for robot and gateway alike: what is sent on loopback is there at once."""
+    with asyncio.Runner(loop_factory=partial(JumpingLoop, pass_s=1e-9)) as runner:
+        return runner.run(scene)
 
 
 async def played(protocol: Protocol, scene: Any, options: dict[str, Any]) -> tuple[list[CheckFinding], Stage]:
@@ -107,7 +115,7 @@ async def played(protocol: Protocol, scene: Any, options: dict[str, Any]) -> tup
 
 
 def play(protocol: Protocol, scene: Any, **options: Any) -> list[CheckFinding]:
-    return asyncio.run(played(protocol, scene, options))[0]
+    return at_once(played(protocol, scene, options))[0]
 
 
 drive = partial(play, scene=motion.check_motion)
@@ -118,7 +126,7 @@ bearing = partial(play, scene=bearings.check_bearings, place=bearings.PLACE)
 
 
 def values(protocol: Protocol) -> list[CheckFinding]:
-    _, stage = asyncio.run(played(protocol, journeys.check_wrap, {}))
+    _, stage = at_once(played(protocol, journeys.check_wrap, {}))
     return [*check_values(protocol, stage.history)]
 
 
@@ -128,7 +136,7 @@ def values(protocol: Protocol) -> list[CheckFinding]:
 @pytest.fixture(scope="module")
 def heard() -> Transcript:
     """What the sound robot says."""
-    return asyncio.run(record(PROTOCOL, 5.0))
+    return at_once(record(PROTOCOL, 5.0))
 
 
 def turns_on(self: Any) -> tuple[bytes, ...]:

@@ -15,7 +15,6 @@ from docs.generate.events import LogCall, calls_of, log_calls
 from zbridge.log import Log, current_robot
 
 ROOT = Path(__file__).parents[1]
-CALLS = list(log_calls())
 WITH_LOGGERS = {"gateways/alf/simulator.py", "gateways/tcpudp/simulator.py", "gateways/wc2ec/simulator.py"}
 """The base of simulators takes a logger of ``logging``: authors of protocols need no other."""
 SILENCED = {"zbridge/views/foxglove/server.py"}
@@ -74,8 +73,9 @@ def test_the_robot_of_the_running_code_is_its_contexts() -> None:
 
 
 def test_every_call_names_its_event_and_gives_the_fields_of_its_sentence() -> None:
-    assert len(CALLS) > 100
-    wrong = [call for call in CALLS if (fault := fault_of(call)) is not None and print(call.place, fault) is None]
+    calls = log_calls()
+    assert len(calls) > 100
+    wrong = [call for call in calls if (fault := fault_of(call)) is not None and print(call.place, fault) is None]
     assert wrong == []
 
 
@@ -91,7 +91,7 @@ def fault_of(call: LogCall) -> str | None:
 
 def test_an_event_means_one_thing() -> None:
     meanings = defaultdict(set)
-    for call in CALLS:
+    for call in log_calls():
         meanings[call.event].add((call.logger, call.template, call.level))
     assert {event: found for event, found in meanings.items() if len(found) > 1} == {}
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+from functools import cache
 from pathlib import Path
 
 from docs.generate import alerts, bus, command_line, configuration, events, faults, metrics
@@ -12,6 +13,7 @@ DOCS = Path(__file__).parents[1]
 PART = re.compile(r"(<!-- generated: ([^>]+) -->\n).*?(<!-- /generated -->)", re.DOTALL)
 
 
+@cache
 def generated() -> dict[str, str]:
     """Return every generated part by its name."""
     parts = (alerts, bus, configuration, command_line, events, faults, metrics)

@@ -6,6 +6,7 @@ import ast
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 from docs.generate.declared import table
@@ -14,6 +15,7 @@ ROOT = Path(__file__).parents[2]
 LEVELS = ("debug", "info", "warning", "error", "critical")
 METHODS = {level: level for level in LEVELS} | {"exception": "error", "log": "", "record": ""}
 _NAMES = re.compile(r"_?log")
+_CALLED = re.compile(r"\b_?log\s*\.")
 
 
 @dataclass(frozen=True)
@@ -28,23 +30,26 @@ class LogCall:
     fields: frozenset[str]
 
 
-def log_calls() -> Iterator[LogCall]:
+@cache
+def log_calls() -> tuple[LogCall, ...]:
     """Give every call of a logger in the source."""
-    for top in ("zbridge", "gateways"):
-        for path in sorted((ROOT / top).rglob("*.py")):
-            if path != ROOT / "zbridge" / "log.py":
-                yield from calls_of(path.relative_to(ROOT).as_posix(), path.read_text())
+    paths = (path for top in ("zbridge", "gateways") for path in sorted((ROOT / top).rglob("*.py")))
+    sources = ((path.relative_to(ROOT).as_posix(), path.read_text()) for path in paths)
+    return tuple(call for path, source in sources if path != "zbridge/log.py" for call in calls_of(path, source))
 
 
 def calls_of(path: str, source: str) -> Iterator[LogCall]:
     """Give the calls of one module."""
+    if _CALLED.search(source) is None:
+        return
     tree = ast.parse(source)
     module = path.removesuffix(".py").replace("/", ".")
     logger = next(
         (_logger(node, module) for node in tree.body if _logger(node, module)), "gateways.<protocol>.simulator"
     )
-    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
-    for node in ast.walk(tree):
+    nodes = list(ast.walk(tree))
+    functions = [node for node in nodes if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+    for node in nodes:
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and _is_log(node.func):
             around = [each for each in functions if each.lineno <= node.lineno <= (each.end_lineno or 0)]
             yield _call(f"{path}:{node.lineno}", logger, node, node.func.attr, around[-1] if around else None)

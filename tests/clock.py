@@ -5,9 +5,12 @@ import functools
 import selectors
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import AbstractAsyncContextManager
-from typing import Any
+from functools import partial
+from typing import Any, TypeVar
 
 import pytest
+
+T = TypeVar("T")
 
 
 class _Jumping(selectors.DefaultSelector):
@@ -45,6 +48,12 @@ class JumpingLoop(asyncio.SelectorEventLoop):
     def pause(self, seconds: float) -> None:
         """Let time pass in which nothing of this process runs, as if it was stopped: all timers are late then."""
         self._jumping.now += seconds
+
+
+def at_once(main: Coroutine[Any, Any, T]) -> T:
+    """Run what drives a simulated robot of its own event loop as :func:`asyncio.run` does, and wait for nothing."""
+    with asyncio.Runner(loop_factory=partial(JumpingLoop, pass_s=1e-9)) as runner:
+        return runner.run(main)
 
 
 def jumping(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., None]:

@@ -55,7 +55,7 @@ def output(process: subprocess.Popen[str]) -> str:
 @pytest.mark.parametrize("style", STYLES)
 def test_a_new_package_passes_its_tests_and_the_conformance_kit_and_is_clean(style: str, tmp_path: Path) -> None:
     name, folder = made(style, tmp_path)
-    kit = started(folder, "zbridge.simulation.check", name)  # mostly waits
+    kit = started(folder, "tests.simulation.at_once", name)
     mypy = started(folder, "mypy", "--strict", "--cache-dir", str(tmp_path / ".mypy"), name, "tests")
     try:
         assert "passed" in output(started(folder, "pytest", "-q", "-p", "no:cacheprovider", "-W", "error"))

@@ -69,7 +69,8 @@ def test_an_example_passes_its_tests_and_is_driven_by_tcp_and_on_a_serial_line(
 
 @pytest.mark.parametrize("protocol", ["khepera", "arcos", "alf", "ros2", "tcpudp", "wc2ec"])
 def test_every_protocol_holds_what_the_conformance_kit_asks(protocol: str) -> None:
-    assert " hold, 0 do not, " in run("zbridge.simulation.check", protocol)
+    kit = "zbridge.simulation.check" if protocol == "ros2" else "tests.simulation.at_once"  # Zenoh has its own time
+    assert " hold, 0 do not, " in run(kit, protocol)
 
 
 def test_a_package_of_an_earlier_release_holds_what_the_conformance_kit_asks(tmp_path: Path, monkeypatch) -> None:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
 import math
 import sys
-from collections.abc import Callable, Coroutine, Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import msgspec
 import pytest
@@ -21,7 +20,7 @@ import arcos.translate
 from arcos import PROTOCOL
 from arcos.messages import PACKETS, Command, Do, Report, Setting
 
-from tests.clock import JumpingLoop
+from tests.clock import at_once
 from zbridge.errors import NotReady
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, Motion, Pose, Scan
@@ -39,7 +38,6 @@ from zbridge.simulation.checks.stops import check_stops
 from zbridge.simulation.checks.values import check_values
 from zbridge.wire import Packets
 
-T = TypeVar("T")
 Robot, Session, Simulated = arcos.translate.ArcosRobot, arcos.session.ArcosSession, arcos.simulator.Arcos
 broken = partial(msgspec.structs.replace, PROTOCOL)
 
@@ -99,13 +97,7 @@ def scaled(factor: float, *names: str) -> Callable[[Any], Any]:
 mirrored_pose = shows(Pose, scaled(-1.0, "y", "heading"))
 mirrored_drive = drives(scaled(-1.0, "turn"))
 
-# Scenes with a simulated robot on loopback
-
-
-def at_once(scene: Coroutine[Any, Any, T]) -> T:
-    """Run a scene on a clock that jumps, for robot and gateway alike: what is sent on loopback is there at once."""
-    with asyncio.Runner(loop_factory=partial(JumpingLoop, pass_s=1e-9)) as runner:
-        return runner.run(scene)
+# Scenes with a simulated robot on loopback, on a clock that jumps
 
 
 async def played(protocol: Protocol, scene: Any, options: dict[str, Any]) -> tuple[list[CheckFinding], Stage]:

@@ -13,6 +13,7 @@ from typing import Any
 import msgspec
 import pytest
 
+from tests.clock import at_once
 from tests.e2e.other_package import toyrobot as toy
 from zbridge.errors import ConfigError
 from zbridge.fleet import topics
@@ -34,18 +35,19 @@ from zbridge.simulation.checks.stops import check_stops
 TOY: Protocol = toy.PROTOCOL
 
 
+waiting = asyncio.run
+
+
 @pytest.fixture(autouse=True)
 def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Watch the toy for a shorter time: it shows its pose ten times a second."""
-    times = {"DRIVE_S": 0.5, "IDLE_S": 0.1, "STAND_S": 0.4, "TURN_S": 0.3, "WATCHED_S": 0.5}
-    for name, seconds in times.items():
-        monkeypatch.setattr(f"zbridge.simulation.checks.motion.{name}", seconds)
+    """Run the kit and the toy on a clock that jumps."""
+    monkeypatch.setattr(asyncio, "run", at_once)
 
 
 @pytest.fixture(scope="module")
 def heard() -> Transcript:
     """What the sound robot says."""
-    return asyncio.run(record(TOY, 5.0))
+    return at_once(record(TOY, 5.0))
 
 
 def failed(findings: Iterable[CheckFinding]) -> dict[str, str]:
@@ -66,7 +68,7 @@ def motion(protocol: Protocol) -> list[CheckFinding]:
             assert await stage.established(5.0)
             return await check_motion(protocol, stage)
 
-    return asyncio.run(drive())
+    return at_once(drive())
 
 
 def claims(value: object) -> str:
@@ -188,7 +190,7 @@ ESTABLISHED = "the session with the simulated robot is established"
 )
 def test_a_session_that_is_not_established_is_found_with_its_reason(opened: Any, problem: str) -> None:
     protocol = with_session(opened=opened)
-    assert_found(check_sessions(protocol, asyncio.run(record(protocol, 0.3))), {ESTABLISHED: problem})
+    assert_found(check_sessions(protocol, at_once(record(protocol, 0.3))), {ESTABLISHED: problem})
 
 
 class Hasty(toy.ToySession):
@@ -200,7 +202,7 @@ class Hasty(toy.ToySession):
 
 def test_what_ends_a_session_names_class_field_and_expectation_and_no_time_that_nobody_waited() -> None:
     protocol = with_session(opened=Hasty.opened)
-    (problem,) = failed(check_sessions(protocol, asyncio.run(record(protocol, 10.0)))).values()
+    (problem,) = failed(check_sessions(protocol, at_once(record(protocol, 10.0)))).values()
     assert re.sub(r":\d+", "", problem) == (
         "link robot (BrokenSession): ended: a fault of the protocol: KeyError: 'x' in Hasty.opened (test_check.py); "
         "last written: nothing; last received: nothing; "
@@ -367,7 +369,7 @@ AHEAD, SPEED, RATE = "it drives ahead after a turn", "it drives as fast as", "it
         (broken(options=Sized), {}),
         (
             broken(options=Sized, simulated={"speed_full_m_s": 10.0, "turn_full_rad_s": 10.0}),
-            {SPEED: "m/s, the options say 0.8", RATE: "rad/s, the options say 6.667 rad/s"},
+            {SPEED: "m/s, the options say 0.333 m/s", RATE: "rad/s, the options say 2.500 rad/s"},
         ),
     ],
     ids=["does not move", "does not stand", "goes the other way", "as the options say", "not as the options say"],
@@ -448,7 +450,8 @@ def never_established(self: Any, now: float) -> None:
         (ends_at_once, "Connect call failed"),
     ],
 )
-def test_what_the_simulated_robot_raises_is_told_at_once(simulate: Any, problem: str) -> None:
+def test_what_the_simulated_robot_raises_is_told_at_once(monkeypatch, simulate: Any, problem: str) -> None:
+    monkeypatch.setattr(asyncio, "run", waiting)
     begun = time.monotonic()
     protocol = msgspec.structs.replace(with_session(opened=never_established), simulate=simulate)
     assert_found(kit.check(protocol, "toy"), {ESTABLISHED: problem})

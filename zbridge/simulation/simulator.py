@@ -33,8 +33,8 @@ M = TypeVar("M")
 
 
 async def live(step: Callable[[int], None]) -> None:
-    """Call ``step`` every :data:`STEP_S` with its number, from 1, until cancelled."""
-    ticker = Ticker(STEP_S, catch_up_s=CATCH_UP_S)
+    """Call ``step`` every :data:`STEP_S` of the event loop's clock with its number, from 1, until cancelled."""
+    ticker = Ticker(STEP_S, catch_up_s=CATCH_UP_S, clock=asyncio.get_running_loop().time)
     for steps in itertools.count(1):
         await ticker.tick()
         step(steps)

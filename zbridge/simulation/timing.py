@@ -27,16 +27,25 @@ STAMPED = ((socket.SOL_SOCKET, _STAMPS, 1),) if sys.platform == "linux" else ()
 class Ticker:
     """Ticks every ``period_s`` seconds, the first time after ``first_s`` (default: a period).
 
-    A late tick delays those after it. ``catch_up_s``: lost time that ticks in quick succession make up for.
+    A late tick delays those after it. ``catch_up_s``: lost time that ticks in quick succession make up for. ``clock``:
+    seconds; None: monotonic ones.
     """
 
-    def __init__(self, period_s: float, *, first_s: float | None = None, catch_up_s: float = 0.0) -> None:
+    def __init__(
+        self,
+        period_s: float,
+        *,
+        first_s: float | None = None,
+        catch_up_s: float = 0.0,
+        clock: Callable[[], float] | None = None,
+    ) -> None:
         self.passed_s = 0.0
         """Seconds between the last two ticks; before the second one, since the ticker was made."""
         self.late_s = 0.0
         """Seconds by which this process slept too long before the last tick."""
         self._period_s, self._catch_up_s = period_s, catch_up_s
-        self._last = time.monotonic()
+        self._clock = clock or time.monotonic
+        self._last = self._clock()
         self._due = self._last + (period_s if first_s is None else first_s)
 
     def __repr__(self) -> str:
@@ -44,9 +53,9 @@ class Ticker:
 
     async def tick(self) -> None:
         """Sleep until the next tick is due."""
-        due = max(self._due, time.monotonic() - self._catch_up_s)
-        await asyncio.sleep(due - time.monotonic())
-        now = time.monotonic()
+        due = max(self._due, self._clock() - self._catch_up_s)
+        await asyncio.sleep(due - self._clock())
+        now = self._clock()
         self.passed_s, self.late_s = now - self._last, now - due
         self._last, self._due = now, due + self._period_s
 

@@ -95,13 +95,13 @@ async def check_reconnect(protocol: Protocol, stage: Stage, establish_s: float) 
         return [
             CheckFinding.not_checked(claim, "it shows no pose", _ODOMETRY) for claim in (CONNECTED_AGAIN, OFF_AND_ON)
         ]
-    stage.close()
+    await stage.close()
     first = await _without_a_jump(stage, CONNECTED_AGAIN, forward, establish_s)
     truth = stage.truth
     if first.problem is not None or truth is None:
         why = NO_TRUTH if truth is None else "the claim before does not hold"
         return [first, CheckFinding.not_checked(OFF_AND_ON, why, _ODOMETRY)]
-    stage.close()
+    await stage.close()
     await stage.device.switch_off()
     stage.device.switch_on((truth.x, truth.y, truth.heading))
     await stage.device.listens()

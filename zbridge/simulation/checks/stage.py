@@ -22,7 +22,7 @@ from zbridge.protocol.plugin import Protocol, Simulation, Truth
 from zbridge.protocol.session import Session, State
 from zbridge.simulation.checks.finding import SimulatorFault
 from zbridge.simulation.checks.rehearsal import Transcript, robot_of
-from zbridge.transport import Conversation, ConversationHooks, connect
+from zbridge.transport import Conversation, ConversationHooks, Link, connect
 
 SHOWN_S = 1.0
 """Seconds that a recording continues after the session was established."""
@@ -62,6 +62,7 @@ class Stage:
         self.truths = device.truths
         """How the simulated robot was, and when; empty: it does not say."""
         self._conversations: list[Conversation] = []
+        self._links: list[Link] = []
         self._loop = asyncio.get_running_loop()
 
     # The conversation
@@ -72,14 +73,14 @@ class Stage:
         if len(names) != len(addresses):
             kind = type(self.robot).__qualname__
             raise ValueError(f"{kind}.link_names: {names}, expected {len(addresses)} of them (Protocol.links)")
-        self.sessions, self._conversations = [], []
+        self.sessions, self._conversations, self._links = [], [], []
         for name, address in zip(names, addresses, strict=True):
             session = self.robot.session(name, str(address))
             if not self.sessions:
                 session.tap = partial(self._tapped, keep=not self.received)
             self.sessions.append(session)
             self._conversations.append(Conversation(session, self._loop, ConversationHooks(deliver=self._deliver)))
-            await connect(self._protocol.device_address(str(address)), self._conversations[-1])
+            self._links.append(await connect(self._protocol.device_address(str(address)), self._conversations[-1]))
 
     def _tapped(self, direction: str, frame: bytes, *, keep: bool) -> None:
         self.frames.append((direction, frame))
@@ -142,9 +143,15 @@ class Stage:
         for conversation in self._conversations:
             conversation.pump()
 
-    def close(self) -> None:
+    async def close(self) -> None:
+        """End the conversations, and wait until no thread of their links runs.
+
+        Two sessions of Zenoh in one process, robot and gateway, that close at the same time may wait for each other.
+        """
         for conversation in self._conversations:
             conversation.abandon()
+        for link in self._links:
+            await link.ended()
 
     # Driving
 
@@ -272,7 +279,7 @@ async def live(
         await stage.connect()
         yield stage
     finally:
-        stage.close()
+        await stage.close()
         await asyncio.sleep(HANG_UP_S)
         await device.switch_off()
 

@@ -39,12 +39,29 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         path = item.path.relative_to(item.config.rootpath).as_posix()
         if any(fnmatch(path, pattern) for pattern in REAL):
             item.add_marker("e2e")
-    if hasattr(config, "workerinput"):
-        items[:] = spread(items)
+    workerinput = getattr(config, "workerinput", None)
+    if workerinput is not None:
+        items[:] = dealt(items, workerinput["workercount"])
+
+
+def dealt(items: list[pytest.Item], workers: int) -> list[pytest.Item]:
+    """Let each worker begin with its share of the longest: a worker of xdist gets a run of the list as long as others.
+
+    A long test that is begun last is waited for by all; of a run that is finished late the other workers take the end.
+    """
+    longest = [item for item in items if item.get_closest_marker("long")]
+    others = spread([item for item in items if not item.get_closest_marker("long")])
+    runs: list[pytest.Item] = []
+    for worker in range(workers):
+        share = longest[worker::workers]
+        rest = max(0, (len(items) - len(runs)) // (workers - worker) - len(share))
+        runs += share + others[:rest]
+        del others[:rest]
+    return runs + others
 
 
 def spread(items: list[pytest.Item]) -> list[pytest.Item]:
-    """Put the modules that mostly wait evenly among those that compute: each worker of xdist gets a run of the list."""
+    """Put the modules that mostly wait evenly among those that compute."""
     placed = []
     for waits in (False, True):
         alike = [item for item in items if (item.get_closest_marker("e2e") is not None) is waits]

@@ -98,6 +98,7 @@ class RosRoom(RosScene):
             assert browser.complaints == []
 
 
+@pytest.mark.long
 async def test_a_ros_publisher_that_drives_is_seen_and_taken_over(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shared: Any
 ) -> None:

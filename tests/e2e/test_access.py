@@ -76,6 +76,7 @@ class Heard:
 WIDE = ("fleet/**", "fleet/**/@cmd/**", "fleet/**/@rpc/**", "fleet/@mark")
 
 
+@pytest.mark.long
 def test_every_role_may_do_what_the_table_says_and_nothing_else(scene: Scene) -> None:
     seen, expected = Matrix(scene.members, scene.far).run(), granted_by_the_code()
     print(table(seen), end="")

@@ -138,6 +138,7 @@ def test_where_both_have_the_robot_one_leaves_it_alone_and_stays_connected(bench
         assert LEFT not in gateway.log
 
 
+@pytest.mark.long
 def test_a_standby_that_took_over_during_a_silent_cut_yields_within_2_s_and_steps_in_when_the_owner_goes(
     bench: Bench,
 ) -> None:

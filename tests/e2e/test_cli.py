@@ -138,6 +138,7 @@ def test_probe_talks_to_a_robot_only_with_yes_and_asks_a_gateway_first(bench: Be
     assert "version: 1.3" in served.stdout
 
 
+@pytest.mark.long
 def test_the_secure_demo_drives_its_robots_by_roles_and_ends_with_0() -> None:
     shown = zbridge("demo", "--secure", "--seconds", "8", timeout_s=120.0)  # nine processes start, one by one
     assert (shown.returncode, shown.stderr) == (0, "")
@@ -149,6 +150,7 @@ def test_the_secure_demo_drives_its_robots_by_roles_and_ends_with_0() -> None:
     assert "  demo  " in shown.stdout  # the operator drives
 
 
+@pytest.mark.long
 def test_the_demo_interrupted_leaves_no_process_behind() -> None:
     demo = start("demo")
     assert demo.stdout is not None

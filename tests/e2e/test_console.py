@@ -105,6 +105,7 @@ def test_all_are_stopped_and_released_and_the_console_ends_orderly(scene: Scene)
     assert scene.console.returncode == 0
 
 
+@pytest.mark.long
 def test_a_killed_gateway_is_missing_a_frozen_one_confirms_nothing_and_a_robot_is_away(scene: Scene) -> None:
     page = scene.page
     scene.gateways["t1"].signal(signal.SIGKILL)
@@ -130,6 +131,7 @@ def test_a_frozen_robot_is_not_said_to_have_stopped_before_its_link_takes_the_st
     assert text in (f"3 of 3 {CONFIRMED}", waits), "its kernel may have accepted the stop: then the gateway has sent it"
 
 
+@pytest.mark.long
 def test_a_robot_that_was_seen_by_an_earlier_console_is_missing_in_the_next(scene: Scene) -> None:
     bench = scene.bench
     end(scene.console)

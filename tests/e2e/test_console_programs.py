@@ -9,6 +9,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from tests.e2e.conftest import HOST, Bench, start, until
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "console-api.md").read_text()
@@ -29,6 +31,7 @@ def user(bench: Bench, *words: str) -> str:
     return str(printed).strip()
 
 
+@pytest.mark.long
 def test_curl_and_python_see_the_fleet_and_stop_it(bench: Bench) -> None:
     user(bench, "add", "lab", "--role", "viewer", "--no-password")
     token = user(bench, "token", "lab")

@@ -84,6 +84,7 @@ def odd_robot() -> Iterator[Robot]:
     robot.close()
 
 
+@pytest.mark.long
 def test_each_robot_of_a_fleet_is_diagnosed_by_what_is_broken_there(bench: Bench, odd_robot: Robot) -> None:
     fleet, at = bench.fleet, ("--connect", bench.endpoint)
     full = '[control]\naudit = "/dev/full"\n'

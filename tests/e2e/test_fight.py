@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import pytest
+
 from tests.e2e.measured.fight import faults, fight, holder_of
 
 
+@pytest.mark.long
 def test_two_drivers_never_move_a_robot_at_the_same_time_and_the_audit_log_tells_all() -> None:
     story = fight(6.0)
     assert not faults(story), story

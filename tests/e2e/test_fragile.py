@@ -87,6 +87,7 @@ def test_nobody_moves_a_robot_without_a_lease(name: str) -> None:
     played(story, name)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("version", "udp"), [("1.1", False), ("1.3", True)])
 def test_a_poor_second_connection_is_named_and_not_driven(version: str, udp: bool) -> None:
     """It loses half of all packets in both directions and sends no telemetry; its client id is 3."""

@@ -22,6 +22,7 @@ def cut(age: str) -> str:
     return ran.stdout
 
 
+@pytest.mark.long
 def test_a_driver_whose_network_heals_moves_no_robot_with_what_it_said_meanwhile() -> None:
     """With max_age_s = 0 it does: the cut held something up."""
     try:

@@ -51,6 +51,7 @@ def run(*arguments: str, code: int = 0) -> str:
     return ran.stdout + ran.stderr
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("package", [EXAMPLES / "khepera", EXAMPLES / "arcos", RELEASED / "khepera"], ids=str)
 def test_an_example_passes_its_tests_and_is_driven_by_tcp_and_on_a_serial_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: Path
@@ -67,17 +68,21 @@ def test_an_example_passes_its_tests_and_is_driven_by_tcp_and_on_a_serial_line(
     assert ran.returncode == 0, ran.stdout
 
 
-@pytest.mark.parametrize("protocol", ["khepera", "arcos", "alf", "ros2", "tcpudp", "wc2ec"])
+@pytest.mark.parametrize(
+    "protocol", ["khepera", "arcos", "alf", "tcpudp", "wc2ec", pytest.param("ros2", marks=pytest.mark.long)]
+)
 def test_every_protocol_holds_what_the_conformance_kit_asks(protocol: str) -> None:
     kit = "zbridge.simulation.check" if protocol == "ros2" else "tests.simulation.at_once"  # Zenoh has its own time
     assert " hold, 0 do not, " in run(kit, protocol)
 
 
+@pytest.mark.long
 def test_a_package_of_an_earlier_release_holds_what_the_conformance_kit_asks(tmp_path: Path, monkeypatch) -> None:
     install({"khepera": RELEASED / "khepera" / "khepera"}, tmp_path / "first", monkeypatch)
     assert " hold, 0 do not, " in run("zbridge.simulation.check", "khepera")
 
 
+@pytest.mark.long
 def test_of_a_robot_that_has_no_hq_side_the_demo_says_so_and_a_listener_is_a_clear_error(tmp_path: Path) -> None:
     """A package that cannot be imported, beside it, is one line, of the demo and of the check of its own file only."""
     about = tmp_path / "site" / "torn-1.0.dist-info"

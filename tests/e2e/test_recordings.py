@@ -201,6 +201,7 @@ def shown(path: Path, robot: str) -> dict[str, list[dict[str, Any]]]:
     return seen
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", CAPTURES)
 def test_replayed_frames_of_a_capture_give_the_messages_that_the_capture_gave(
     bench: Bench, tmp_path: Path, name: str

@@ -137,6 +137,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
         yield lab
 
 
+@pytest.mark.long
 async def test_each_case_is_named_by_the_client_by_ls_and_by_run(lab: Lab, caplog: pytest.LogCaptureFixture) -> None:
     some = asyncio.Semaphore(AT_A_TIME)
     assert await asyncio.gather(*(again(told, lab, case, some) for case in CASES)) == [True] * len(CASES)

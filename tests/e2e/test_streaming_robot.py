@@ -117,6 +117,7 @@ def stopped_then_off(pioneer: StreamingRobot, since: float) -> bool:
 # Silence
 
 
+@pytest.mark.long
 async def test_a_silent_robot_is_stopped_needs_neutral_and_is_found_again_where_it_was_after_longer(
     bench: Bench, pioneer: StreamingRobot
 ) -> None:
@@ -147,6 +148,7 @@ async def test_a_silent_robot_is_stopped_needs_neutral_and_is_found_again_where_
     gateway.end()
 
 
+@pytest.mark.long
 async def test_a_gateway_that_was_paused_blames_no_silence_on_the_robot_and_stops_it_before_anything_else(
     bench: Bench, pioneer: StreamingRobot
 ) -> None:
@@ -312,6 +314,7 @@ class Host:
         assert "Traceback" not in self.supervisor.log, self.supervisor.log
 
 
+@pytest.mark.long
 def test_a_driven_robot_whose_gateway_is_restarted_killed_or_frozen_stands_and_keeps_its_connection_and_its_pulse(
     bench: Bench, pioneer: StreamingRobot
 ) -> None:

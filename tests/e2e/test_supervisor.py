@@ -148,6 +148,7 @@ def test_eight_robots_of_which_one_crashes_and_one_gets_a_faulty_file(host: Host
     assert all(count > 0 for count in stopped)
 
 
+@pytest.mark.long
 def test_robots_rest_and_stay_usable_whatever_their_gateway_dies_of_and_at_whatever_step_of_a_restart() -> None:
     plan = [
         Case("tcpudp-1.3", "hung"),

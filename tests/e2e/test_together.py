@@ -9,6 +9,8 @@ import signal
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
+
 from tests.access import LAB
 from tests.benchmarks.fleet_robots import READING, REGISTERED
 from tests.e2e.conftest import HOST, WAIT_S, end, start
@@ -87,6 +89,7 @@ async def drives_well(fleet: Fleet, robot: str) -> None:
         assert drive.loss is None
 
 
+@pytest.mark.long
 async def test_robots_of_one_process_and_certificate_are_driven_while_one_of_them_misbehaves(tmp_path: Path) -> None:
     async with contextlib.AsyncExitStack() as stack:
         bus = await asyncio.to_thread(SecureBus, tmp_path / "bus", ROLES)

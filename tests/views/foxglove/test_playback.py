@@ -230,3 +230,15 @@ async def test_the_time_waits_for_a_disk_that_is_slow(scene: Scene, monkeypatch:
     assert scene.viewer.times[-1] == pytest.approx(3.0, abs=LATE_S)
     await asyncio.sleep(2.0)
     assert scene.seen() == poses(4, 5)
+
+
+async def test_a_process_that_is_late_at_the_end_shows_what_it_has_not_read_yet(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("zbridge.views.foxglove.playback.BATCH", 4)
+    scene.subscribe(scene.viewer, "/r1/pose")
+    await scene.asks(play=True, seek=1.0, speed=50.0)
+    asyncio.get_running_loop().pause(LATE_S - 0.02)  # type: ignore[attr-defined]
+    await asyncio.sleep(2.0)
+    assert scene.seen()[-9:] == [f"/r1/pose {second}" for second in range(2, 11)]
+    assert scene.viewer.states[-1][0] == ENDED

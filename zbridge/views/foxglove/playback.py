@@ -213,7 +213,7 @@ class Playback(ViewerSource):
         """Show messages when their time comes, until cancelled."""
         ahead: list[PlayedMessage] = []
         entries: Iterator[PlayedMessage] = iter(())
-        sent_at = 0.0
+        sent_at, read_all = 0.0, False
         while True:
             self._changed.clear()
             if self._backfill:
@@ -221,10 +221,12 @@ class Playback(ViewerSource):
                 continue
             if self._from_ns is not None:  # what was recorded at this very time was shown as the last before it
                 entries, ahead, self._from_ns = self._recording.messages(self._from_ns + 1), [], None
-            if not ahead:
+                read_all = False
+            if not ahead and not read_all:
                 ahead = await asyncio.to_thread(list, itertools.islice(entries, BATCH))
                 if self._from_ns is not None:  # a seek came meanwhile
                     continue
+                read_all = len(ahead) < BATCH
                 ahead.reverse()
             now = self._loop.time()
             if ahead and self._clock.playing and self._clock.wait_s(ahead[-1].log_ns, now) < -LATE_S:
@@ -234,7 +236,7 @@ class Playback(ViewerSource):
                 self.hub.publish(message.topic, message.log_ns, message.payload)
             if self._clock.playing and now - sent_at >= TICK_S:
                 sent_at = now
-                self._send_time(ended=not ahead)
+                self._send_time(ended=read_all and not ahead)
             await self._wait(ahead)
 
     async def _wait(self, ahead: list[PlayedMessage]) -> None:

@@ -55,7 +55,8 @@ async def test_old_programs_of_every_protocol_see_a_ros_robot_and_drive_it_in_tu
                 await soon(lambda: fleet.last("r1/control").get("state") == "free", "given back")
                 forward = DRIVES[program.name]
                 await pushed(program, forward, partial(scene.moves, forward), f"{program.name} drives")
-                assert fleet.last("r1/control")["holder"] == f"hq.{program.name}.{program.number}"
+                holder = f"hq.{program.name}.{program.number}"
+                await soon(lambda holder=holder: fleet.last("r1/control")["holder"] == holder, holder)
                 await program.idle()
                 await soon(lambda: not any(robot.velocity), "at rest")
                 await program.release()

@@ -149,8 +149,8 @@ def _doubtful_end(data: bytes, start: int, end: int, size: int) -> int:
         if found is not None:
             inner_end, payload_at, message_id = found
             spec = MESSAGES.get(message_id)
-            if inner_end > size:
-                waits = waits or spec is not None or message_id < 0
+            if inner_end > size:  # it is waited for if it may be one of ours: what is behind it waits too
+                waits = waits or message_id < 0 or (spec is not None and data[at + 1] <= spec.size)
             elif spec is not None and _sum_matches(data, at, payload_at, inner_end, spec.crc_extra):
                 return at
         at = _next_marker(data, at, size)

@@ -160,7 +160,7 @@ async def test_an_address_to_is_a_client_unasked_lasts_in_silence_and_is_made_ag
         first = served.came[0]
         assert first.link is not None
         await asyncio.sleep(0.15)
-        assert (first.reason, first.link.lasting, first.link.peer) == (None, True, f"udp://127.0.0.1:{port}")
+        assert (first.reason, first.link.speaks_first, first.link.peer) == (None, True, f"udp://127.0.0.1:{port}")
         first.link.write(b"heartbeat")
         data, listener = await heard_by(desk)
         desk.sendto(b"hello", listener)

@@ -176,7 +176,7 @@ class Client:
             self.conversation.close("only malformed messages")
         elif self._stalled_s >= STALL_S:
             self.conversation.cut(f"read nothing for {STALL_S:g} s")
-        elif idle_s is not None and self._silent_s >= idle_s and (link is None or not link.lasting):
+        elif idle_s is not None and self._silent_s >= idle_s and (link is None or not link.speaks_first):
             self.conversation.close(f"silent for {idle_s:g} s")
 
     def close(self) -> None:

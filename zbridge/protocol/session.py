@@ -85,6 +85,8 @@ class Session(Kept, ABC, Generic[M]):
     """Seconds without a message after which the robot is not driven; ``inf``: a healthy robot may be silent."""
     lost_s: float | None = None
     """Seconds without a message after which the session ends; None: it never ends for that."""
+    speaks_first = False
+    """Whether we speak first on a link of datagrams; else the peer did, and may be anybody."""
     keep_alive: KeepAlive | None = None
     """What the robot's watchdog needs. It leaves only while this process works, so the watchdog stops a robot whose
     gateway hangs."""
@@ -157,9 +159,9 @@ class Session(Kept, ABC, Generic[M]):
         """Begin: the transport is up. A session that has ended stays so."""
         self._on(SessionEvent.OPEN, now=now)
 
-    def by_datagrams(self) -> None:
-        """Take the bytes of each :meth:`receive` as one datagram of whole frames: the link has no stream."""
-        self.transport = "udp"
+    def by_datagrams(self, *, speaks_first: bool) -> None:
+        """Take each :meth:`receive` as one datagram. speaks_first: see the attribute."""
+        self.transport, self.speaks_first = "udp", speaks_first
         self._frames = DatagramFrames(self.frame_end, self.limits.frame_bytes, self.malformed)
 
     def receive(self, data: bytes, now: float) -> list[M]:

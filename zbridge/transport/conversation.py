@@ -135,7 +135,7 @@ class Conversation(Receiver):
         if self.reading.suspended:
             link.suspend()
         if link.datagrams_only:
-            self.session.by_datagrams()
+            self.session.by_datagrams(speaks_first=link.speaks_first)
             link.unsent = self.session.traffic.drop
         self.session.peer = link.peer
         self.session.open(self._clock())

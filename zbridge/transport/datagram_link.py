@@ -124,6 +124,7 @@ async def connect(address: DatagramAddress, receiver: Receiver, kernel: Kernel =
                     first, where = sock.recvfrom(DATAGRAM_BYTES)
                 sock.connect(where)
                 link = DatagramLink(sock, receiver)
+                link.speaks_first = not address.waits
         except (OSError, UnicodeError) as error:
             reason = getattr(error, "strerror", None) or str(error) or f"no datagram within {CONNECT_S:g} s"
             raise LinkError(f"{address}: {reason}") from error

@@ -56,8 +56,8 @@ class Link(ABC):
     peer = ""
     datagrams_only = False
     """Whether there is no stream: each write is a datagram, and each ``received`` is one, of whole frames."""
-    lasting = False
-    """Whether the peer may be silent for as long as it likes."""
+    speaks_first = False
+    """Whether we speak first by datagrams, and the peer may be silent for as long as it likes."""
     receiver: Receiver
     """Takes what is read."""
 

@@ -101,11 +101,12 @@ class SourceHub(DatagramReader):
         assert self._socket is not None
         return self._socket
 
-    def link(self, source: Source, receiver: Receiver | None = None) -> SourceLink:
+    def link(self, source: Source, receiver: Receiver | None = None, *, speaks_first: bool = False) -> SourceLink:
         """Return the link of a source, made if there is none; one that was refused has ended already."""
         link = self.links.get(source)
         if link is None:
             link = self.links[source] = SourceLink(self, source, receiver or self._receiver())
+            link.speaks_first = speaks_first
             link.receiver.attached(link)
         return link
 
@@ -131,7 +132,7 @@ class SourceHub(DatagramReader):
         self._resting = {source: until for source, until in self._resting.items() if now < until}
         for link in tuple(self.links.values()) if not self._suspended else ():
             link.silent_sweeps += 1
-            if link.silent_sweeps > _SWEEPS and not link.lasting:
+            if link.silent_sweeps > _SWEEPS and not link.speaks_first:
                 self.end(link, f"silent for {SILENT_S:g} s")
 
     def close(self) -> None:
@@ -216,8 +217,8 @@ class SourceDoor(Door):
                         found = (await resolved(address, self._sources.bound.family))[:2]
                     before = links.get(address)
                     if before is not None:
-                        before.lasting = before.source == found  # else it ends by its silence
-                    if self._sources.admits and not (before and before.ready and before.lasting):
-                        links[address] = link = self._sources.link(found)
-                        link.lasting = True
+                        before.speaks_first = before.source == found  # else it ends by its silence
+                    if self._sources.admits and not (before and before.ready and before.speaks_first):
+                        links[address] = link = self._sources.link(found, speaks_first=True)
+                        link.speaks_first = True
             await asyncio.sleep(TO_S)

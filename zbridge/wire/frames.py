@@ -142,14 +142,19 @@ class DatagramFrames(FrameBuffer):
 
     def feed(self, data: bytes) -> Iterator[bytes]:
         """Yield every frame of a datagram; raise nothing."""
+        start, size = 0, len(data)
         try:
-            yield from super().feed(data)
-            if self._rest:
-                self._dropped(f"the last {len(self._rest)} bytes of a datagram are no whole frame")
+            while start < size:
+                end = self._end(data, start)
+                if end > size:  # nothing follows: what waits for more is judged as if zeros did
+                    end = self._end(data + bytes(self._limit), start)
+                if end > size:
+                    self._dropped(f"the last {size - start} bytes of a datagram are no whole frame")
+                    return
+                yield data[start:end]
+                start = end
         except ProtocolError as error:
             self._dropped(str(error))
-        finally:
-            self._rest.clear()
 
 
 def _name(function: FrameEnd) -> str:

@@ -6,6 +6,7 @@ Source: "The gateway as vehicle" of the protocol page.
 from __future__ import annotations
 
 import math
+import secrets
 from collections.abc import Callable
 
 from gateways.mavlink.frames import MavlinkFrame
@@ -15,11 +16,13 @@ from gateways.mavlink.station.driving import RELEASE, enter, is_deflected
 from gateways.mavlink.station.session import Station
 from gateways.mavlink.station.streams import STREAMED
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Stop
+from zbridge.fleet.messages import Control, Stop
 from zbridge.fleet.view import RobotView
 from zbridge.protocol import Telemetry
 
 Ordered = tuple[Result, tuple[Telemetry, ...]]
+STOPPED = ("stopped", "latched")
+"""The states of ``control`` after a stop."""
 _US_PER_S = 1e6
 _REQUESTABLE = STREAMED | {148}
 """Ids that are sent once where they are asked for."""
@@ -57,9 +60,12 @@ def hindrance(station: Station, view: RobotView) -> str | None:
         return None
     if control.latches:
         return f"stop {control.latches[-1].described}"
-    if control.holder in (None, station.who) or (control.priority or 0) < 0:
-        return None
-    return f"held by {control.holder}"
+    return f"held by {control.holder}" if is_held(control, station.who) else None
+
+
+def is_held(control: Control, who: str) -> bool:
+    """Return whether somebody else holds the robot from whom a listener's client cannot take it."""
+    return control.holder not in (None, who) and (control.priority or 0) >= 0
 
 
 def _arm(station: Station, message: CommandLong | CommandInt) -> Ordered:
@@ -103,7 +109,7 @@ def _terminate(station: Station, message: CommandLong | CommandInt) -> Ordered:
 def _stop(station: Station) -> Ordered:
     """Stop the robot, whoever drives it."""
     station.rest(station.now)
-    return Result.ACCEPTED, ((topics.CMD_STOP, Stop(who=station.who)),)
+    return Result.ACCEPTED, ((topics.CMD_STOP, Stop(id=secrets.token_bytes(16), who=station.who)),)
 
 
 def _refused(station: Station) -> Ordered | None:

@@ -13,7 +13,7 @@ import math
 from gateways.mavlink.frames import MavlinkFrame
 from gateways.mavlink.messages.control import ManualControl, RcChannelsOverride, SetPositionTargetLocalNed
 from gateways.mavlink.numbers import BODY_NED, BODY_OFFSET_NED, RoverMode
-from gateways.mavlink.station.session import Station
+from gateways.mavlink.station.session import CENTRE_US, Station
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive
 from zbridge.protocol import Telemetry
@@ -21,13 +21,17 @@ from zbridge.protocol import Telemetry
 LIVE_S = 0.35
 GAP_S = 0.5
 """Seconds between two setpoints, or since a stick was heard, that are too many."""
+OVERRIDE_S = 3.0
+"""Seconds for which an RC override counts where a later one leaves a channel as it is."""
 RELEASE = "release the stick (QGC: centre is zero throttle)"
 TOO_SLOW = "send setpoints at 4 Hz or more"
 VELOCITY_ONLY = "only velocity setpoints, frame 8 or 9"
 _FULL = 1000
 _GIVEN_BACK, _UNCHANGED = 32767, 65535
-_CENTRE_US, _US_TO_STICK = 1500, 2
-_NO_VX, _NO_YAW_RATE = 8, 2048
+_US_TO_STICK = 2
+_NOT_VELOCITY, _NO_YAW_RATE = 0x1C7, 0x800
+_VELOCITY_ONLY = _NOT_VELOCITY | 0x008
+"""Bits of ``type_mask``: positions and accelerations must be ignored, the velocity ahead must not."""
 _NEUTRAL = Drive()
 
 
@@ -38,18 +42,24 @@ def manual_control(station: Station, message: ManualControl, sender: MavlinkFram
 
 def rc_override(station: Station, message: RcChannelsOverride, sender: MavlinkFrame) -> tuple[Telemetry, ...]:
     """Take a stick in the place of an RC receiver's: channels 1 and 3, us; 0 gives one back."""
-    channels = station.stick.channels_us
+    stick = station.stick
+    if station.now - stick.heard_at > OVERRIDE_S:
+        stick.channels_us = [CENTRE_US, CENTRE_US]
+    channels = stick.channels_us
     for place, us in enumerate((message.chan3_raw, message.chan1_raw)):
         if us != _UNCHANGED:
-            channels[place] = us or _CENTRE_US
-    return _move_stick(station, *((us - _CENTRE_US) * _US_TO_STICK for us in channels))
+            channels[place] = us or CENTRE_US
+    return _move_stick(station, *((us - CENTRE_US) * _US_TO_STICK for us in channels))
 
 
 def setpoint(station: Station, message: SetPositionTargetLocalNed, sender: MavlinkFrame) -> tuple[Telemetry, ...]:
     """Take a velocity ahead and a yaw rate; all else is ignored, and told."""
     if not (station.armed and station.mode == RoverMode.GUIDED):
         return ()
-    if message.coordinate_frame not in (BODY_NED, BODY_OFFSET_NED) or message.type_mask & _NO_VX:
+    if (
+        message.coordinate_frame not in (BODY_NED, BODY_OFFSET_NED)
+        or message.type_mask & _VELOCITY_ONLY != _NOT_VELOCITY
+    ):
         station.warn(VELOCITY_ONLY)
         return ()
     options = station.options

@@ -6,7 +6,7 @@ Source: "The gateway as vehicle" and "Translation" of the protocol page.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 from gateways.mavlink.frames import MavlinkFrame
 from gateways.mavlink.messages import MavlinkMessage, control
@@ -34,6 +34,7 @@ class MavlinkHq(HqSide):
 
     name = "mavlink"
     hands_over = True
+    kept: ClassVar[dict[str, Any]] = {"vehicle": ShownRover}
     deadman_s = DEADMAN_S
     follows = ("pose", "motion", "scan", "battery", "text", "control")
 
@@ -42,8 +43,7 @@ class MavlinkHq(HqSide):
         self.view = view
         self.vehicle = ShownRover(options, view)
         self.parameters = Parameters(options, DEADMAN_S)
-        self._stopped: str | None = None
-        """The state of ``control`` as it was shown last."""
+        self._shown: Control | None = None
 
     def session(self, number: int, bounds: Limits) -> Station:
         return Station(self.options, self.vehicle, self.parameters, bounds)
@@ -80,13 +80,14 @@ class MavlinkHq(HqSide):
 
     def _control(self, news: Control) -> Send | None:
         """Let nobody seem to drive who does not: after a stop, or while somebody else holds the robot."""
-        stopped = news.state in ("stopped", "latched") and news.state != self._stopped
-        self._stopped = news.state
+        before, self._shown = self._shown, news
+        told = (before.state, before.stops, before.latches) if before is not None else None
+        stopped = news.state in commands.STOPPED and told != (news.state, news.stops, news.latches)
         if not stopped and news.holder is None:
             return None
 
         def send(session: Station, now: float) -> None:
-            if stopped or session.who != news.holder:
+            if stopped or commands.is_held(news, session.who):
                 session.rest(now)
 
         return send

@@ -21,9 +21,12 @@ from gateways.mavlink.station.streams import TIMED, Streams
 from gateways.mavlink.station.vehicle import ShownRover
 from gateways.mavlink.texts import chunks_of, clip
 from zbridge.fleet.messages import Drive
-from zbridge.protocol import Limits, Refused, Role
+from zbridge.protocol import Limits, Refused, Role, State
 
 HEARTBEAT_S = 1.0
+SILENT_S = 5.0
+"""Seconds without a frame after which a station is not armed any more: its address may be another program's then."""
+CENTRE_US = 1500
 WARN_S = 2.0
 """Seconds within which a warning that the client's stream causes is not repeated."""
 _STICKS = 64
@@ -38,7 +41,7 @@ class SaidMotion(msgspec.Struct):
 
     axes: tuple[int, int] = (0, 0)
     heard_at: float = -math.inf
-    channels_us: list[int] = msgspec.field(default_factory=lambda: [1500, 1500])
+    channels_us: list[int] = msgspec.field(default_factory=lambda: [CENTRE_US, CENTRE_US])
     """Throttle and steering of the RC override."""
     entered: bool = False
     """Whether GUIDED was entered, and no motion has counted since."""
@@ -53,7 +56,14 @@ class Station(MavlinkSession[MavlinkFrame]):
     """A ground station. vehicle, parameters: what it is told of the robot."""
 
     role = Role.ROBOT
-    kept: ClassVar[dict[str, Any]] = {"mode": int, "armed": bool, "there": bool, "streams": Streams, "_texts": int}
+    kept: ClassVar[dict[str, Any]] = {
+        "mode": int,
+        "armed": bool,
+        "there": bool,
+        "streams": Streams,
+        "now": float,
+        "_texts": int,
+    }
 
     def __init__(self, options: MavlinkHqOptions, vehicle: ShownRover, parameters: Parameters, bounds: Limits) -> None:
         super().__init__(options.system_id, AUTOPILOT, bounds)
@@ -68,7 +78,7 @@ class Station(MavlinkSession[MavlinkFrame]):
         self.now = -math.inf
         """When it was read last."""
         self._kind = BOAT if options.kind == "boat" else ROVER
-        self._beats_at = math.inf
+        self._beats_at = 0.0
         self._texts = 0
         self._warned: dict[str, float] = {}
 
@@ -80,7 +90,9 @@ class Station(MavlinkSession[MavlinkFrame]):
     # What the core calls
 
     def opened(self, now: float) -> None:
-        self.establish("", ())
+        """Speak first: programs wait for it. A source of datagrams must show first that it speaks MAVLink."""
+        if self.transport != "udp" or self.speaks_first:
+            self.establish("", ())
 
     def receive(self, data: bytes, now: float) -> list[MavlinkFrame]:
         self.now = now
@@ -90,6 +102,9 @@ class Station(MavlinkSession[MavlinkFrame]):
         return read_frame(frame)
 
     def accept(self, message: MavlinkFrame, now: float) -> bool:
+        if message.message is None and self.state is not State.ESTABLISHED:
+            return False
+        self.establish("", ())
         return True
 
     def timers(self) -> float:
@@ -105,9 +120,11 @@ class Station(MavlinkSession[MavlinkFrame]):
     # What it is shown
 
     def beat(self, now: float) -> None:
-        """Show mode and arming at once, and then every second."""
+        """Show mode and arming at once, and then every second; disarmed, if nothing is heard of the station."""
         if not self.there:
             return
+        if now - self.now >= SILENT_S:
+            self.armed, self.mode = False, RoverMode.HOLD
         base = CUSTOM_MODE | _STICKS | (ARMED if self.armed else 0)
         state = _ACTIVE if self.armed else _STANDBY
         heartbeat = MavlinkHeartbeat(self.mode, self._kind, ARDUPILOT, base, state, _MAVLINK)
@@ -124,6 +141,7 @@ class Station(MavlinkSession[MavlinkFrame]):
 
     def rest(self, now: float) -> None:
         """Show HOLD, disarmed: the client does not drive."""
+        self.stick.channels_us = [CENTRE_US, CENTRE_US]
         if self.armed or self.mode != RoverMode.HOLD:
             self.armed, self.mode = False, RoverMode.HOLD
             self.beat(now)

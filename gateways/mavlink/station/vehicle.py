@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from gateways.mavlink.numbers import BODY_FRD
 from gateways.mavlink.station.options import MavlinkHqOptions
 from zbridge.fleet.messages import Battery, FleetMessage, Motion, Pose, Scan
 from zbridge.fleet.view import RobotView
+from zbridge.protocol import Kept
 
 M_PER_DEGREE = 111_319.5
 """Metres of a degree of latitude, as ArduPilot counts."""
@@ -37,8 +39,10 @@ FIRMWARE = 4 << 24 | 5 << 16 | 255
 """ArduRover 4.5, official: what its programs expect of a rover holds for it."""
 
 
-class ShownRover:
+class ShownRover(Kept):
     """The robot of one listener as a rover."""
+
+    kept: ClassVar[dict[str, Any]] = {"_begun_ns": int | None}
 
     def __init__(self, options: MavlinkHqOptions, view: RobotView) -> None:
         self.options = options
@@ -118,7 +122,10 @@ class ShownRover:
         scan = self.view.scan
         if scan is None or not len(scan.ranges):
             return None
-        least_cm, most_cm = (round(_bounded(max(0.0, m) * _CM, _MOST_CM)) for m in (scan.range_min, scan.range_max))
+        if not math.isfinite(scan.angle_min + scan.angle_increment):
+            return None
+        least_cm = round(_bounded(max(0.0, scan.range_min) * _CM, _MOST_CM))
+        most_cm = round(_bounded(scan.range_max * _CM, _MOST_CM)) if 0 < scan.range_max < math.inf else _MOST_CM
         cm = nearest_cm(scan, most_cm)
         increment = 360 / _POINTS
         return telemetry.ObstacleDistance(
@@ -202,7 +209,7 @@ class ShownRover:
         battery = self._battery
         if battery is None:
             return UNKNOWN_16, -1, -1
-        volts, amperes, level = battery.voltage, battery.current, battery.level
+        volts, amperes, level = map(_known, (battery.voltage, battery.current, battery.level))
         return (
             UNKNOWN_16 if volts is None else round(_bounded(max(0.0, volts) * 1000, 65534)),
             -1 if amperes is None else round(_bounded(max(0.0, -amperes) * 100, 32767)),
@@ -227,6 +234,10 @@ def nearest_cm(scan: Scan, most_cm: int) -> np.ndarray[tuple[int], np.dtype[np.u
 
 def _finite(value: float) -> float:
     return value if math.isfinite(value) else 0.0
+
+
+def _known(value: float | None) -> float | None:
+    return value if value is not None and math.isfinite(value) else None
 
 
 def _bounded(value: float, most: float) -> float:

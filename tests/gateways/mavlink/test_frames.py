@@ -11,7 +11,7 @@ from gateways.mavlink.frames import LIMIT_BYTES, MavlinkFrame, checksum, frame_e
 from gateways.mavlink.messages.control import CommandLong, ManualControl, SetPositionTargetLocalNed
 from gateways.mavlink.messages.telemetry import Attitude, MavlinkHeartbeat, ObstacleDistance, Statustext
 from zbridge.errors import EncodeError, ProtocolError
-from zbridge.wire.frames import FrameBuffer
+from zbridge.wire.frames import DatagramFrames, FrameBuffer
 
 ROVER = bytes.fromhex("fd0900000001010000000f0000000a03c10403ac7c")
 STICK = bytes.fromhex("fd0b000000ffbe450000000006fff401000000000146e7")
@@ -172,3 +172,27 @@ def test_what_is_no_frame_is_refused(frame: bytes) -> None:
 def test_values_that_have_no_room_are_refused(message: MavlinkHeartbeat | Statustext, system: int) -> None:
     with pytest.raises(EncodeError):
         write_frame(message, 0, system, 1)
+
+
+HIDDEN = bytes.fromhex("fd080000070101f11700") + b"\xfe\xff\0\0\0\0\0\1" + b"\x12\x34"
+"""A message that is not declared. In its payload -2, an int16, and zeros: they look like a heartbeat of 255 bytes."""
+
+
+@pytest.mark.parametrize("size", [1, 7, 1000])
+def test_a_stop_does_not_wait_behind_a_message_that_is_not_known(size: int) -> None:
+    buffer, seen = FrameBuffer(frame_end, LIMIT_BYTES), []
+    data = HIDDEN + HOLD
+    for start in range(0, len(data), size):
+        seen += buffer.feed(data[start : start + size])
+    assert seen == [HIDDEN, HOLD]
+
+
+@pytest.mark.parametrize("unknown", [HIDDEN, UNKNOWN, UNKNOWN[:-1] + b"\xfd", UNKNOWN[:-1] + b"\xfe"])
+def test_nothing_waits_at_the_end_of_a_datagram(unknown: bytes) -> None:
+    dropped: list[str] = []
+    frames = DatagramFrames(frame_end, LIMIT_BYTES, dropped.append)
+    for datagram in (HOLD + unknown, unknown + HOLD, unknown + HOLD[:-1], HOLD):
+        pieces = list(frames.feed(datagram))
+        assert unknown in (*pieces, unknown if datagram == HOLD else b"")
+        assert (HOLD in pieces) is (HOLD in datagram)
+    assert len(dropped) == 1

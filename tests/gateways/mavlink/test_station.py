@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gateways.mavlink.station.driving import VELOCITY_ONLY
 from gateways.mavlink.station.hq import MavlinkHq
 from gateways.mavlink.station.options import MavlinkHqOptions, Origin
 from zbridge.fleet import topics
@@ -492,6 +493,100 @@ def test_motion_that_does_not_change_may_be_ended() -> None:
     assert drives(ground.aims(0.5)) == [Drive()]
     assert ground.shown == (HOLD, False)
     assert not ground.aims(0.5)
+
+
+# What a review found
+
+
+def test_heartbeats_go_on_in_another_process() -> None:
+    scene, ground = guided()
+    scene.publishes("pose", Pose(0.0, 0.0, 0.0, stamp_ns=1_000_000_000))
+    heir = Scene()
+    heir.side.restore(scene.side.export())
+    session = heir.side.session(1, BOUNDS)
+    session.restore(ground.session.export())
+    ground.session, ground.scene, heir.stations = session, heir, [ground]
+    ground.hears()
+    heir.runs(1.1)
+    assert ground.shown == (GUIDED, True)
+    heir.publishes("pose", Pose(0.0, 0.0, 0.0, stamp_ns=3_000_000_000))
+    assert ground.heard("ATTITUDE")[-1].time_boot_ms == 2000
+
+
+def test_an_override_of_long_ago_is_no_throttle() -> None:
+    scene = Scene()
+    (ground,) = scene.stations
+    ground.says(mavlink.MAVLink_rc_channels_override_message(SYSTEM, 1, 1500, 65535, 2000, 0, 0, 0, 0, 0))
+    scene.runs(3.5)
+    ground.mode(MANUAL)
+    ground.commands(ARM, 1)
+    steering = mavlink.MAVLink_rc_channels_override_message(SYSTEM, 1, 1600, 65535, 65535, 0, 0, 0, 0, 0)
+    assert drives(ground.says(steering)) == [Drive(turn=-0.2)]
+
+
+def test_a_station_of_which_nothing_is_heard_is_not_armed_any_more() -> None:
+    scene, ground = guided()
+    scene.runs(4.9)
+    assert ground.shown == (GUIDED, True)
+    scene.runs(1.1)
+    assert ground.shown == (HOLD, False)
+
+
+def test_another_stop_disarms_who_armed_since() -> None:
+    scene = Scene()
+    (ground,) = scene.stations
+    scene.publishes("control", Control("stopped"))
+    ground.commands(ARM, 1)
+    scene.publishes("control", Control("stopped", stops=(bytes(16),)))
+    assert ground.shown == (HOLD, False)
+
+
+def test_a_holder_of_less_priority_does_not_keep_a_station_from_arming() -> None:
+    scene = Scene()
+    (ground,) = scene.stations
+    for _ in range(2):
+        scene.publishes("control", Control("held", holder="patrol", priority=-1))
+        ground.commands(ARM, 1)
+        assert ground.shown == (HOLD, True)
+
+
+@pytest.mark.parametrize("speaks_first", [False, True])
+def test_a_source_of_datagrams_must_speak_mavlink_first(speaks_first: bool) -> None:
+    scene = Scene(0)
+    session = scene.side.session(1, BOUNDS)
+    session.by_datagrams(speaks_first=speaks_first)
+    session.open(scene.now)
+    for noise in (b"x", bytes.fromhex("fd000000000000ffff000000")):  # a message of an unknown id
+        session.receive(noise, scene.now)
+    assert (session.state.value == "established") is speaks_first
+    session.receive(bytes.fromhex("fd0900000001010000000f0000000a03c10403ac7c"), scene.now)
+    assert session.state.value == "established"
+
+
+@pytest.mark.parametrize("most", [math.inf, math.nan, 0.0])
+def test_a_scan_without_a_range_hides_no_obstacle(most: float) -> None:
+    scene = Scene()
+    (ground,) = scene.stations
+    ground.says(mavlink.MAVLink_request_data_stream_message(SYSTEM, 1, 12, 4, 1))
+    scene.publishes("scan", Scan(0.0, 0.1, math.nan, most, np.array([2.0], np.float32)))
+    (seen,) = ground.heard("OBSTACLE_DISTANCE")
+    assert (seen.distances[0], seen.min_distance, seen.max_distance) == (200, 0, 65534)
+    scene.publishes("scan", Scan(math.nan, 0.1, 0.1, 6.0, np.array([2.0], np.float32)))
+    assert not ground.heard("OBSTACLE_DISTANCE")
+
+
+def test_a_battery_that_is_not_known_is_not_empty() -> None:
+    scene = Scene()
+    (ground,) = scene.stations
+    scene.publishes("battery", Battery(level=math.nan, voltage=math.inf, current=math.nan))
+    (shown,) = ground.heard("BATTERY_STATUS")
+    assert (shown.voltages[0], shown.current_battery, shown.battery_remaining) == (65535, -1, -1)
+
+
+def test_a_position_with_a_velocity_is_no_velocity() -> None:
+    _, ground = guided()
+    assert not ground.aims(0.7, frame=9, mask=0)
+    assert ground.texts == [VELOCITY_ONLY]
 
 
 def test_messages_of_unknown_ids_are_counted_under_one_name() -> None:

@@ -34,6 +34,8 @@ from tests.e2e.rigs.loss import LATE_S
 PACKAGES = ("MAVProxy", "pymavlink", "pyserial", "defusedxml", "numpy", "lxml", "fastcrc")
 MODULES = "mode,arm,rc,param,cmdlong,link"
 STEP_S = 0.02
+SETTLE_S = 0.3
+"""Seconds between arming and motion, as a person takes: the stick must be seen at rest once armed, ten times a second."""
 PARAMS_S = 10.0
 """Seconds for the parameters: it asks after 3 s."""
 
@@ -86,10 +88,11 @@ def drive(scene: GroundStationScene, proxy: MavProxy) -> None:
     for channel in (1, 3):
         proxy.type(f"rc {channel} 1500")
     proxy.type("mode manual")
-    proxy.prints("Mode MANUAL")
+    proxy.prints("DO_SET_MODE: ACCEPTED")  # modes are told every two seconds at most
     proxy.type("arm throttle")
     proxy.prints("COMPONENT_ARM_DISARM: ACCEPTED")
     proxy.prints("ARMED")
+    time.sleep(SETTLE_S)
     proxy.type("rc 3 1700")
     scene.drives(0.4 * FULL_M_S, 0.0)
 
@@ -117,7 +120,7 @@ def holds_it(scene: GroundStationScene, proxy: MavProxy) -> None:
     """Stop by the mode HOLD, and not arm while the throttle is pushed."""
     asked = time.monotonic()
     proxy.type("mode hold")
-    proxy.prints("Mode HOLD")
+    proxy.prints("DO_SET_MODE: ACCEPTED")
     proxy.prints("DISARMED")
     assert scene.robot.stopped(asked, 1.0) < 1.0, "the stop is late"  # MAVProxy reads its commands ten times a second
     scene.free()
@@ -140,6 +143,7 @@ def disarms_it(scene: GroundStationScene, proxy: MavProxy) -> None:
 def is_refused(scene: GroundStationScene, proxy: MavProxy) -> None:
     """Be refused, with the holder's name, while another program holds the robot; drive when that has left."""
     scene.bench.fleet.hold("r1", "desk", lease_s=2.0)
+    until(lambda: scene.control["holder"] == "desk", what="the holder is shown")
     for channel in (1, 3):
         proxy.type(f"rc {channel} 1500")
     proxy.type("arm throttle")

@@ -25,7 +25,7 @@ TEMPORARILY_REJECTED, FAILED = 1, 4
 ARM, SET_MODE, MANUAL = 400, 176, 0
 YAW_DEG_S, YAW_RAD_S = 20.0, 0.349
 TEXT_BYTES = 50
-ORIGIN = "origin = { lat = 47.0, lon = 8.0, compass_deg = 90.0 }"
+ORIGIN = "origin = { latitude = 47.0, longitude = 8.0 }"
 
 
 @pytest.fixture
@@ -141,11 +141,11 @@ def test_mavsdk_and_programs_of_other_protocols_take_turns(tmp_path: Path, stack
     port = free_port()
     old = f'[[hq]]\nname = "old"\nprotocol = "tcpudp"\nlisten = "tcp://{HOST}:{port}"\n'
     scene = GroundStationScene(tmp_path, stack, "wc2ec", old)
-    until(lambda: scene.gateway.listens(4), what="listeners")
     program = scene.mavsdk()
     program.connected()
     fleet = scene.bench.fleet
     fleet.hold("r1", "desk", lease_s=2.0)
+    until(lambda: scene.control["holder"] == "desk", what="the holder is shown")
     since = len(program.said)
     assert program.ask("arm")["result"] == "COMMAND_DENIED"
     _told(program, since, "desk")
@@ -153,7 +153,8 @@ def test_mavsdk_and_programs_of_other_protocols_take_turns(tmp_path: Path, stack
     scene.free()
     stick = Part(stack, *module("tests.e2e.rigs.hq_programs", "tcpudp", HOST, port))
     assert stick.line() == "ready"
-    until(lambda: stick.say("push") or not scene.robot.still(), what="the old program drives")
+    stick.say("push")
+    until(lambda: not scene.robot.still(), what="the old program drives")
     since = len(program.said)
     assert program.ask("arm")["result"] == "COMMAND_DENIED"
     _told(program, since, "old")

@@ -35,7 +35,7 @@ PACKAGES = ("MAVProxy", "pymavlink", "pyserial", "defusedxml", "numpy", "lxml", 
 MODULES = "mode,arm,rc,param,cmdlong,link"
 STEP_S = 0.02
 SETTLE_S = 0.3
-"""Seconds between arming and motion, as a person takes: the stick must be seen at rest once armed, ten times a second."""
+"""Seconds between arming and motion, as a person takes: the stick must be seen at rest once it is armed."""
 PARAMS_S = 10.0
 """Seconds for the parameters: it asks after 3 s."""
 

@@ -183,8 +183,8 @@ class GroundStationScene:
         to = f'to = "udp://{HOST}:{self.desk}"'
         parts = [
             station("tcp", f"tcp://{HOST}:{self.tcp}", options=options),
-            # station("udp", f"udp://{HOST}:{self.udp}", options=options),
-            # station("spoken", f"udp://{HOST}:{self.spoken}", to, options=options),
+            station("udp", f"udp://{HOST}:{self.udp}", options=options),
+            station("spoken", f"udp://{HOST}:{self.spoken}", to, options=options),
         ]
         self.gateway = self.bench.gateway(device(self.robot.port, protocol, DEVICES[protocol]), *parts, *more)
         self.urls = {

@@ -180,7 +180,7 @@ class GroundStationScene:
         stack.callback(self.robot.close)
         self.bench = Bench(folder, stack)
         self.tcp, self.udp, self.spoken, self.desk = (free_port() for _ in range(4))
-        to = f'to = "udp://{HOST}:{self.desk}"'
+        to = f'to = ["udp://{HOST}:{self.desk}"]'
         parts = [
             station("tcp", f"tcp://{HOST}:{self.tcp}", options=options),
             station("udp", f"udp://{HOST}:{self.udp}", options=options),

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.e2e.conftest import HOST, repeated, until
-from tests.e2e.rigs.ground_stations import FASTEST_M_S, FULL_M_S, GroundStationScene, Mavsdk, RawStation
+from tests.e2e.rigs.ground_stations import FASTEST_M_S, FULL_M_S, SYSTEM, GroundStationScene, Mavsdk, RawStation
 from tests.e2e.rigs.loss import LATE_S
 from tests.e2e.rigs.processes import Part, module
 from tests.ports import free_port
@@ -180,6 +180,56 @@ def _told(program: Mavsdk, since: int, holder: str) -> None:
     assert {one["refused"] for one in said if one.get("command") in (ARM, SET_MODE)} == {TEMPORARILY_REJECTED}
     assert all(len(one["text"].encode()) <= TEXT_BYTES for one in said if "text" in one)
     assert not any(one.get("armed") for one in said)
+
+
+def test_what_a_rover_would_do_by_itself_is_refused_and_its_end_is_a_stop(
+    tmp_path: Path, stack: contextlib.ExitStack
+) -> None:
+    scene = GroundStationScene(tmp_path, stack, "wc2ec", options=ORIGIN)
+    program, began = scene.mavsdk(), time.monotonic()
+    program.connected()
+    program.do("arm")
+    assert program.ask("home")["result"] == "COMMAND_DENIED"
+    assert program.ask("goto", 47.001, 8.001, 0.0, 0.0)["result"] == "UNSUPPORTED"
+    assert scene.robot.still(began)
+    for word in ("kill", "terminate"):
+        _drive(scene, program)
+        asked = time.monotonic()
+        program.do(word)
+        scene.stops(asked, AT_ONCE_S)
+        until(lambda: program.last("armed") is False, what="it is shown as disarmed")
+        scene.free()
+
+
+def test_of_two_robots_at_one_port_a_program_drives_its_own(tmp_path: Path, stack: contextlib.ExitStack) -> None:
+    scene = GroundStationScene(tmp_path, stack, "wc2ec")
+    other, began = scene.another(), time.monotonic()
+    program = scene.mavsdk("spoken", SYSTEM + 1)
+    program.connected()
+    program.offboard(FULL_M_S / 2)
+    until(lambda: other.moves(FULL_M_S / 2), what="the other robot moves")
+    assert scene.robot.still(began), "both robots move"
+    assert scene.control["holder"] is None
+    asked = time.monotonic()
+    program.do("hold")
+    assert other.stopped(asked, AT_ONCE_S) < 1.0
+
+
+def test_mavsdk_loses_a_robot_that_is_lost_and_does_not_drive_it_when_it_is_back(
+    tmp_path: Path, stack: contextlib.ExitStack
+) -> None:
+    scene = GroundStationScene(tmp_path, stack, "wc2ec")
+    program = scene.mavsdk()
+    program.connected()
+    _drive(scene, program)
+    scene.robot.close()
+    until(lambda: program.last("link") is False, what="MAVSDK takes the robot for lost")
+    scene.robot.begin()
+    back = time.monotonic()
+    until(lambda: program.last("link") is True, what="MAVSDK is connected again")
+    until(lambda: program.last("armed") is False, what="it is shown as disarmed")
+    assert scene.robot.still(back)
+    _drive(scene, program)
 
 
 def test_a_stick_of_mavsdk_drives_ahead_and_steers(tmp_path: Path, stack: contextlib.ExitStack) -> None:

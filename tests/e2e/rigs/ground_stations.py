@@ -61,6 +61,10 @@ class SimulatedRobot:
         self.port = free_port()
         self.moments: list[Moment] = []
         self._protocol = protocol
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin to live, again at the same port."""
         self._loop = asyncio.new_event_loop()
         self._ready = threading.Event()
         self._task: asyncio.Task[None] | None = None
@@ -84,10 +88,11 @@ class SimulatedRobot:
             runner.run(live())
 
     def close(self) -> None:
-        """End it."""
-        assert self._task is not None
-        self._loop.call_soon_threadsafe(self._task.cancel)
-        self._thread.join()
+        """End it; idempotent."""
+        if self._thread.is_alive():
+            assert self._task is not None
+            self._loop.call_soon_threadsafe(self._task.cancel)
+            self._thread.join()
 
     def motion(self, over_s: float = 0.2) -> Motion:
         """Give how it has moved since a while ago."""
@@ -121,9 +126,9 @@ class SimulatedRobot:
 class Mavsdk:
     """One program on MAVSDK: what it has said, and the commands that it is given."""
 
-    def __init__(self, stack: contextlib.ExitStack, url: str) -> None:
+    def __init__(self, stack: contextlib.ExitStack, url: str, *system: int) -> None:
         self.said: list[dict[str, Any]] = []
-        self.part = Part(stack, *module("tests.e2e.rigs.mavsdk_operator", url), heard=self._hear)
+        self.part = Part(stack, *module("tests.e2e.rigs.mavsdk_operator", url, *system), heard=self._hear)
 
     def _hear(self, line: str) -> None:
         self.said.append(json.loads(line))
@@ -196,9 +201,18 @@ class GroundStationScene:
         until(lambda: self.gateway.listens(sum(part.count("[[hq]]") for part in (*parts, *more))), 30, "listeners")
         until(lambda: fleet.state() == "established" and fleet.last("r1/control"), 30, "established")
 
-    def mavsdk(self, link: str = "tcp") -> Mavsdk:
+    def mavsdk(self, link: str = "tcp", *system: int) -> Mavsdk:
         """Start a program on MAVSDK that connects by ``tcp``, ``udp``, or ``spoken``: by UDP, and we speak first."""
-        return Mavsdk(self.stack, self.urls[link])
+        return Mavsdk(self.stack, self.urls[link], *system)
+
+    def another(self) -> SimulatedRobot:
+        """Begin another robot, r2, whose gateway speaks to the same port of the desk; its system is one more."""
+        robot = SimulatedRobot(self.protocol)
+        self.stack.callback(robot.close)
+        said = station("two", f"udp://{HOST}:{free_port()}", f'to = ["udp://{HOST}:{self.desk}"]', system=SYSTEM + 1)
+        self.bench.gateway(device(robot.port, self.protocol, DEVICES[self.protocol]), said, robot="r2")
+        until(lambda: self.bench.fleet.state("r2") == "established", 30, "established")
+        return robot
 
     @property
     def control(self) -> dict[str, Any]:
@@ -223,9 +237,9 @@ class GroundStationScene:
         assert took_s <= within_s + late_s, f"told to stand still after {took_s:.3f} s, not {within_s} s"
 
 
-def station(name: str, listen: str, *lines: str, options: str = "") -> str:
+def station(name: str, listen: str, *lines: str, options: str = "", system: int = SYSTEM) -> str:
     """Write a listener for ground stations: more lines of it, and of its options."""
-    full = (f"system_id = {SYSTEM}", f"speed_full_m_s = {FULL_M_S}", f"turn_full_rad_s = {FULL_RAD_S}", options, "")
+    full = (f"system_id = {system}", f"speed_full_m_s = {FULL_M_S}", f"turn_full_rad_s = {FULL_RAD_S}", options, "")
     head = ("[[hq]]", f'name = "{name}"', 'protocol = "mavlink"', f'listen = "{listen}"', *lines, "[hq.options]")
     return "\n".join((*head, *full))
 

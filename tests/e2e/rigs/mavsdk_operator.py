@@ -1,11 +1,12 @@
 """A person's program on MAVSDK, unmodified, in a process of its own that a scene commands by lines.
 
-    python -m tests.e2e.rigs.mavsdk_operator URL         # tcpout://HOST:PORT, udpout://HOST:PORT, udpin://HOST:PORT
+    python -m tests.e2e.rigs.mavsdk_operator URL [SYSTEM]    # tcpout://HOST:PORT, udpout://..., udpin://...
 
 Each line on stdin is a command of :class:`Operator` with its numbers; each line on stdout a JSON object. A command is
 answered by ``{"did": COMMAND, "result": WORD, ...}``, one after the other. In between come ``{"connected": SECONDS}``
-since the connection was asked for, and, as they change or arrive, ``armed``, ``mode``, ``healthy``, ``text`` and
-``refused`` (the raw result of a command's COMMAND_ACK that is not ACCEPTED). The end of stdin is an orderly end.
+since the connection was asked for, and, as they change or arrive, ``armed``, ``mode``, ``healthy``, ``link``, ``text``
+and ``refused`` (the raw result of a command's COMMAND_ACK that is not ACCEPTED). The end of stdin is an orderly end.
+SYSTEM says which vehicle, where several speak to one port.
 
 MAVSDK repeats a setpoint 20 times a second by itself. It does not repeat a stick: ``stick`` does, until ``release``.
 """
@@ -58,6 +59,8 @@ class Operator:
             "hold": self._action.hold,
             "kill": self._action.kill,
             "goto": self._action.goto_location,
+            "home": self._action.return_to_launch,
+            "terminate": self._action.terminate,
             "setpoint": self._setpoint,
             "start": self._offboard.start,
             "stop": self._offboard.stop,
@@ -177,13 +180,16 @@ async def _lines() -> AsyncIterator[str]:
         yield line.decode()
 
 
-async def main(url: str) -> None:
+async def main(url: str, number: str = "") -> None:
     """Connect, and carry out commands until stdin ends."""
     log_subscribe(lambda *_: True)  # it would be printed on stdout
     async with Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION)) as mavsdk:
         began = time.monotonic()
         await mavsdk.add_any_connection(url)
         system = await mavsdk.first_autopilot(CONNECT_S)
+        while number and system is not None and await system.get_system_id() != int(number):
+            await asyncio.sleep(0.05)
+            system = (await mavsdk.get_systems())[-1]
         if system is None:
             sys.exit(f"no vehicle at {url}")
         say(connected=time.monotonic() - began, system=await system.get_system_id())
@@ -196,4 +202,4 @@ async def main(url: str) -> None:
 
 
 if __name__ == "__main__":
-    asyncio.run(main(sys.argv[1]))
+    asyncio.run(main(*sys.argv[1:]))

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import signal
 import subprocess
 import sys
 import tempfile
@@ -32,22 +33,33 @@ from tests.e2e.rigs.ground_stations import FULL_M_S, FULL_RAD_S, GroundStationSc
 from tests.e2e.rigs.loss import LATE_S
 
 PACKAGES = ("MAVProxy", "pymavlink", "pyserial", "defusedxml", "numpy", "lxml", "fastcrc")
-MODULES = "mode,arm,rc,param,cmdlong,link"
-STEP_S = 0.02
-SETTLE_S = 0.3
-"""Seconds between arming and motion, as a person takes: the stick must be seen at rest once it is armed."""
+MODULES = "mode,arm,rc,param,ftp,cmdlong,link"
+DEADMAN_S = 0.5
+SILENT_S = DEADMAN_S + LATE_S + 0.02
+"""Seconds until the robot, which tells once a step, must be told to stand still when nothing is heard any more."""
+LINKS: dict[str, Callable[[GroundStationScene], str]] = {
+    "tcp": lambda scene: f"tcp:{HOST}:{scene.tcp}",
+    "udp": lambda scene: f"udpout:{HOST}:{scene.udp}",
+    "spoken": lambda scene: f"udpin:{HOST}:{scene.desk}",
+}
+"""How MAVProxy connects; ``spoken``: by UDP, and the gateway speaks first."""
+SETTLE_S = 0.6
+"""Seconds between arming and motion, as a person takes: once it is armed, the stick must be seen at rest for 0.3 s."""
 PARAMS_S = 10.0
 """Seconds for the parameters: it asks after 3 s."""
+
+
+Check = Callable[[GroundStationScene, "MavProxy"], None]
 
 
 class MavProxy:
     """A running MAVProxy: commands go in, and all that it prints is read."""
 
-    def __init__(self, stack: contextlib.ExitStack, environment: Path, folder: Path, port: int) -> None:
+    def __init__(self, stack: contextlib.ExitStack, environment: Path, folder: Path, master: str) -> None:
         self._log, self._read = folder / "mavproxy.log", 0
         command = [
             *(str(environment / "bin" / "python"), str(environment / "bin" / "mavproxy.py")),
-            *("--master", f"tcp:{HOST}:{port}", "--state-basedir", str(folder), f"--default-modules={MODULES}"),
+            *("--master", master, "--state-basedir", str(folder), f"--default-modules={MODULES}"),
         ]
         log = stack.enter_context(self._log.open("w"))
         self._process = subprocess.Popen(
@@ -76,6 +88,9 @@ class MavProxy:
         assert self._process.stdin is not None
         self._process.stdin.write(f"{command}\n")
         self._process.stdin.flush()
+
+    def signal(self, number: int) -> None:
+        self._process.send_signal(number)
 
     def kill(self) -> None:
         """Kill it; idempotent."""
@@ -156,17 +171,30 @@ def is_refused(scene: GroundStationScene, proxy: MavProxy) -> None:
     drive(scene, proxy)
 
 
+def is_frozen(scene: GroundStationScene, proxy: MavProxy) -> None:
+    """Stop when MAVProxy hangs; the throttle that it repeats afterwards moves nothing."""
+    assert not scene.robot.still()
+    frozen = time.monotonic()
+    proxy.signal(signal.SIGSTOP)
+    scene.stops(frozen, SILENT_S)
+    proxy.signal(signal.SIGCONT)
+    thawed = time.monotonic()
+    time.sleep(DEADMAN_S)
+    assert scene.robot.still(thawed), "it moves on by itself"
+    proxy.type("mode hold")
+    proxy.prints("DO_SET_MODE: ACCEPTED")
+    scene.free()
+    drive(scene, proxy)
+
+
 def is_lost(scene: GroundStationScene, proxy: MavProxy) -> None:
     """Stop when MAVProxy is killed."""
-    assert not scene.robot.still()
     killed = time.monotonic()
     proxy.kill()
-    scene.stops(killed, LATE_S + STEP_S)
+    scene.stops(killed, SILENT_S)
 
 
-CHECKS: tuple[Callable[[GroundStationScene, MavProxy], None], ...] = (
-    *(sees_it, drives_it, holds_it, disarms_it, is_refused, is_lost),
-)
+CHECKS: tuple[Check, ...] = (*(sees_it, drives_it, holds_it, disarms_it, is_refused, is_frozen, is_lost),)
 
 
 def installed(environment: Path) -> Path:
@@ -182,24 +210,36 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     own = Path(tempfile.gettempdir()) / "zbridge-mavproxy"
     parser.add_argument("--environment", type=Path, default=own, metavar="DIR")
+    parser.add_argument("--link", action="append", choices=LINKS, help="default: one after the other")
     parser.add_argument("--log", action="store_true", help="show what MAVProxy printed")
     wanted = parser.parse_args()
-    environment, failed = installed(wanted.environment), False
+    environment = installed(wanted.environment)
+    results = [run(environment, link, log=wanted.log) for link in wanted.link or LINKS]
+    sys.exit(not all(results))
+
+
+def run(environment: Path, link: str, *, log: bool) -> bool:
+    """Let MAVProxy do all of it by one link; tell whether it did."""
     with contextlib.ExitStack() as stack, tempfile.TemporaryDirectory() as folder:
         scene = GroundStationScene(Path(folder), stack, "wc2ec")
-        proxy = MavProxy(stack, environment, Path(folder), scene.tcp)
-        for check in CHECKS:
-            began = time.monotonic()
-            try:
-                check(scene, proxy)
-            except AssertionError as error:
-                print(f"FAILED {check.__name__}: {error}", flush=True)
-                failed = True
-                break
-            print(f"ok {check.__name__} ({time.monotonic() - began:.1f} s): {check.__doc__}", flush=True)
-        if failed or wanted.log:
-            print(proxy.printed, scene.gateway.log if failed else "", sep="\n")
-    sys.exit(failed)
+        proxy = MavProxy(stack, environment, Path(folder), LINKS[link](scene))
+        went_well = all(_judge(check, scene, proxy, link) for check in CHECKS)
+        if log or not went_well:
+            print(proxy.printed)
+        if not went_well:
+            print(scene.gateway.log)
+        return went_well
+
+
+def _judge(check: Check, scene: GroundStationScene, proxy: MavProxy, link: str) -> bool:
+    began = time.monotonic()
+    try:
+        check(scene, proxy)
+    except AssertionError as error:
+        print(f"FAILED {link} {check.__name__}: {error}", flush=True)
+        return False
+    print(f"ok {link} {check.__name__} ({time.monotonic() - began:.1f} s): {check.__doc__}", flush=True)
+    return True
 
 
 if __name__ == "__main__":

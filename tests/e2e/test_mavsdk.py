@@ -80,32 +80,34 @@ def test_mavsdk_sees_where_a_robot_is(tmp_path: Path, stack: contextlib.ExitStac
     until(agrees, what="pose and telemetry agree")
 
 
-def test_a_robot_stops_when_mavsdk_is_told_to_or_is_lost(tmp_path: Path, stack: contextlib.ExitStack) -> None:
+@pytest.mark.parametrize(("link", "killed_s"), [("tcp", AT_ONCE_S), ("udp", SILENT_S)])
+def test_a_robot_stops_when_mavsdk_is_told_to_or_is_lost(
+    tmp_path: Path, stack: contextlib.ExitStack, link: str, killed_s: float
+) -> None:
     scene = GroundStationScene(tmp_path, stack, "wc2ec")
-    for link, killed_s in (("tcp", AT_ONCE_S), ("udp", SILENT_S)):
-        program, doomed = scene.mavsdk(link), scene.mavsdk(link)
-        program.connected()
-        for word in ("hold", "disarm"):
-            _drive(scene, program)
-            asked = time.monotonic()
-            program.tell(word)
-            scene.stops(asked, AT_ONCE_S)
-            scene.free()
+    program, doomed = scene.mavsdk(link), scene.mavsdk(link)
+    program.connected()
+    for word in ("hold", "disarm"):
         _drive(scene, program)
-        frozen = time.monotonic()
-        program.part.signal(signal.SIGSTOP)
-        scene.stops(frozen, SILENT_S)
-        program.part.signal(signal.SIGCONT)  # it repeats its setpoint, which moves nothing until it is neutral
-        thawed = time.monotonic()
-        time.sleep(DEADMAN_S)
-        assert scene.robot.still(thawed), "it moves on by itself"
-        program.do("hold")
+        asked = time.monotonic()
+        program.tell(word)
+        scene.stops(asked, AT_ONCE_S)
         scene.free()
-        doomed.connected()
-        _drive(scene, doomed)
-        killed = time.monotonic()
-        doomed.part.signal(signal.SIGKILL)
-        scene.stops(killed, killed_s)
+    _drive(scene, program)
+    frozen = time.monotonic()
+    program.part.signal(signal.SIGSTOP)
+    scene.stops(frozen, SILENT_S)
+    program.part.signal(signal.SIGCONT)  # it repeats its setpoint, which moves nothing until it is neutral
+    thawed = time.monotonic()
+    time.sleep(DEADMAN_S)
+    assert scene.robot.still(thawed), "it moves on by itself"
+    program.do("hold")
+    scene.free()
+    doomed.connected()
+    _drive(scene, doomed)
+    killed = time.monotonic()
+    doomed.part.signal(signal.SIGKILL)
+    scene.stops(killed, killed_s)
 
 
 def _drive(scene: GroundStationScene, program: Mavsdk) -> None:

@@ -229,12 +229,13 @@ class GroundStationScene:
         assert motion is not None
         return motion
 
-    def stops(self, after: float, within_s: float) -> None:
-        """Wait until the robot is told to stand still; later than a machine that is not busy allows is an error."""
+    def stops(self, after: float, within_s: float) -> float:
+        """Wait until the robot is told to stand still, and give when; too late, but for a busy machine, is an error."""
         withheld_s = self.bench.withheld_s
         took_s = self.robot.stopped(after, within_s)
         late_s = self.bench.withheld_s - withheld_s
         assert took_s <= within_s + late_s, f"told to stand still after {took_s:.3f} s, not {within_s} s"
+        return took_s
 
 
 def station(name: str, listen: str, *lines: str, options: str = "", system: int = SYSTEM) -> str:

@@ -23,6 +23,8 @@ from zbridge.protocol import Telemetry
 Ordered = tuple[Result, tuple[Telemetry, ...]]
 STOPPED = ("stopped", "latched")
 """The states of ``control`` after a stop."""
+STOPPING_S = 1.0
+"""Longest wait until a stop is shown, seconds."""
 _US_PER_S = 1e6
 _REQUESTABLE = STREAMED | {148}
 """Ids that are sent once where they are asked for."""
@@ -60,6 +62,8 @@ def hindrance(station: Station, view: RobotView) -> str | None:
         return None
     if control.latches:
         return f"stop {control.latches[-1].described}"
+    if station.now - station.stop_asked_at < STOPPING_S:
+        return "stopping"
     return f"held by {control.holder}" if is_held(control, station.who) else None
 
 
@@ -107,8 +111,9 @@ def _terminate(station: Station, message: CommandLong | CommandInt) -> Ordered:
 
 
 def _stop(station: Station) -> Ordered:
-    """Stop the robot, whoever drives it."""
+    """Stop the robot, whoever drives it. Until that is shown, nobody arms: it would disarm what was armed since."""
     station.rest(station.now)
+    station.stop_asked_at = station.now
     return Result.ACCEPTED, ((topics.CMD_STOP, Stop(id=secrets.token_bytes(16), who=station.who)),)
 
 

@@ -5,6 +5,7 @@ Source: "The gateway as vehicle" and "Translation" of the protocol page.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -89,6 +90,8 @@ class MavlinkHq(HqSide):
         def send(session: Station, now: float) -> None:
             if stopped or commands.is_held(news, session.who):
                 session.rest(now)
+            if stopped:
+                session.stop_asked_at = -math.inf
 
         return send
 

@@ -77,6 +77,8 @@ class Station(MavlinkSession[MavlinkFrame]):
         self.streams = Streams()
         self.now = -math.inf
         """When it was read last."""
+        self.stop_asked_at = -math.inf
+        """When it asked for a stop that ``control`` has not shown yet."""
         self._kind = BOAT if options.kind == "boat" else ROVER
         self._beats_at = 0.0
         self._texts = 0

@@ -461,6 +461,23 @@ def test_a_takeover_and_a_stop_show_every_client_that_it_does_not_drive() -> Non
     assert first.shown == (HOLD, True)
 
 
+def test_nobody_arms_until_the_stop_that_they_asked_for_is_shown() -> None:
+    scene, ground = guided()
+    scene.publishes("control", Control("held", holder="hq.mavlink:5760.1", priority=0))
+    ground.mode(HOLD)
+    for command in ((ARM, 1), (SET_MODE, 1, GUIDED)):
+        assert not ground.commands(int(command[0]), *command[1:])
+        assert ground.acknowledged[-1] == (command[0], REJECTED)
+        assert ground.texts[-1] == "stopping"
+    scene.publishes("control", Control("stopped"))
+    ground.commands(ARM, 1)
+    assert ground.shown == (HOLD, True)
+    ground.mode(HOLD)
+    scene.runs(1.1)  # a stop that is never shown is not waited for any longer
+    ground.commands(ARM, 1)
+    assert ground.shown == (HOLD, True)
+
+
 def test_refused_motion_is_shown_by_the_armed_bit_at_once() -> None:
     scene, ground = guided()
     assert ground.shown == (GUIDED, True)

@@ -21,6 +21,8 @@ STEP_S = 0.02
 """The robot tells how it is once a step."""
 AT_ONCE_S, SILENT_S = LATE_S + STEP_S, DEADMAN_S + LATE_S + STEP_S
 CONNECTED_S = 2.0
+RESTS_S = 0.4
+"""Seconds for which a stick must rest once it counts: 0.3, and the time between two."""
 TEMPORARILY_REJECTED, FAILED = 1, 4
 ARM, SET_MODE, MANUAL = 400, 176, 0
 YAW_DEG_S, YAW_RAD_S = 20.0, 0.349
@@ -111,8 +113,7 @@ def test_a_robot_stops_when_mavsdk_is_told_to_or_is_lost(
 
 
 def _drive(scene: GroundStationScene, program: Mavsdk) -> None:
-    program.offboard(FULL_M_S / 2)
-    scene.drives(FULL_M_S / 2)
+    scene.driven(program, FULL_M_S / 2)
 
 
 def test_a_second_program_is_refused_by_name_and_may_stop_the_first(
@@ -241,6 +242,7 @@ def test_a_stick_of_mavsdk_drives_ahead_and_steers(tmp_path: Path, stack: contex
     program.do("stick", 0.0, 0.0)
     program.do("manual")
     program.do("arm")
+    time.sleep(RESTS_S)
     program.do("stick", 0.5, 0.3)
     scene.drives(FULL_M_S / 2, -0.3)
     asked = time.monotonic()

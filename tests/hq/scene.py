@@ -19,7 +19,7 @@ from tests.fake_link import FakeLink
 from tests.hq.gateway import KEYS, Gateway
 from zbridge.clocks import Clocks
 from zbridge.control.events import StopCause
-from zbridge.errors import EncodeError, ProtocolError
+from zbridge.errors import EncodeError, ProtocolError, Unsupported
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.lease_messages import Acquire
@@ -341,6 +341,7 @@ STEPS: dict[str, Callable[[Scene, str], object]] = {
     "operator-drives": lambda scene, _: scene.gateway.authority.acquire(OPERATOR, scene.now),
     "operator-takes-over": lambda scene, _: scene.gateway.authority.takeover(OPERATOR, scene.now),
     "gateway-refuses": lambda scene, why: scene.gateway.authority.require_neutral(why, StopCause.ROBOT_BUSY),
+    "gateway-leaves-out": lambda scene, what: scene.gateway.authority.refuse("drive", Unsupported(what), "hq.toy.2"),
     "gateway-forgets": lambda scene, _: scene.gateway.authority.stop("a new gateway knows of no lease"),
     "shown": lambda scene, _: scene.show(),
     "forget": lambda scene, _: scene.driven(),

@@ -134,6 +134,8 @@ a program that shows whether it drives is shown each time that it does not [side
     a greets; a says go; a hears ! connected: centre the joystick first, off; a says go; a hears off; a says stand, go
     shown; a hears hq.toy.2; operator-takes-over; shown
     a hears operator, ! not driving: the lease has ended (taken over by operator), off
+a program that shows whether it drives still does where a part of its motion is left out [side=ShowingSide]
+    a drives; gateway-leaves-out turn; shown; a hears ! drive: turn, hq.toy.2; holder hq.toy.2
 what a driver's lease was taken for is shown, and only to the driver [side=ShowingSide]
     a drives; b greets; shown; a hears hq.toy.2; b hears hq.toy.2; frozen 5; wait 0.15; a hears off; b hears nothing
 a refused client is told why, and not all the time

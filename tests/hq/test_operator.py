@@ -161,7 +161,7 @@ class Scene:
             who=f"hq.toy.{number}",
             protocol="toy",
             is_motion=is_motion_of_wheels if kind == "steers" else lambda command: command.moving,
-            tell=self.told.append,
+            tell=lambda text, drives: self.told.append(text),
             clock=lambda: self.now,
             clock_ms=lambda: self.now * 1000,
         )

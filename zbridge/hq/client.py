@@ -9,7 +9,6 @@ import asyncio
 import logging
 import math
 from collections.abc import Callable, Iterable
-from functools import partial
 from typing import Any
 
 from zbridge.errors import EncodeError, ProtocolError, Refused
@@ -287,7 +286,7 @@ class Client:
             who=f"hq.{self._context.name}.{self.number}",
             protocol=side.name,
             is_motion=side.is_motion,
-            tell=partial(self.tell, drives=False),
+            tell=lambda text, drives: self.tell(text, drives=drives),
             clock=self._context.clock,
             clock_ms=self._context.clock_ms,
         )

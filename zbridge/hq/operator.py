@@ -38,7 +38,7 @@ OURS_S = 1.0
 
 
 class Operator:
-    """The commands of one client, and its lease. ``tell`` shows a text to its people.
+    """The commands of one client, and its lease. ``tell``: shows a text to its people, and whether the client drives.
 
     who: the client's name on the bus and its liveliness token. protocol: of the client; only robots of the same one are
     told a control mode, and only once the client has chosen one. is_motion: whether a command is motion, see
@@ -53,7 +53,7 @@ class Operator:
         who: str,
         protocol: str,
         is_motion: Callable[[Drive | Motor], bool],
-        tell: Callable[[str], None],
+        tell: Callable[[str, bool], None],
         clock: Callable[[], float],
         clock_ms: Callable[[], float],
     ) -> None:
@@ -161,7 +161,8 @@ class Operator:
             if refusal.command != "acquire" and (refusal.who is not None or lately):
                 if refusal.code == Code.NEUTRAL_FIRST:
                     self.intent.refused("motion was refused")
-                self._tell(f"{refusal.command}: {refusal.reason}")
+                left_out = refusal.code == Code.UNSUPPORTED  # perhaps only a part: the robot may move
+                self._tell(f"{refusal.command}: {refusal.reason}", left_out)
 
     def gateway_lost(self) -> None:
         """Record that the robot's gateway is gone, and every lease with it."""
@@ -238,7 +239,7 @@ class Operator:
             why = str(event.error)
             self._drop(why)
             self.intent.lost(why)
-            self._tell(f"not driving: {why}")
+            self._tell(f"not driving: {why}", False)
 
     def _begin(self, lease_s: float | None) -> None:
         self.intent.granted(lease_s)

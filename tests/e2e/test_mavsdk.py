@@ -17,6 +17,8 @@ from tests.e2e.rigs.processes import Part, module
 from tests.machine import contended_s
 from tests.ports import free_port
 
+for needed in ("mavsdk", "pymavlink"):
+    pytest.importorskip(needed)
 DEADMAN_S = 0.5
 STEP_S = 0.02
 """The robot tells how it is once a step."""

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 from tests.e2e.conftest import HOST, WAIT_S, Bench, device, until
 from tests.e2e.rigs.processes import Part, module
-from tests.machine import contended_s
+from tests.machine import Withheld
 from tests.ports import free_port
 from zbridge.protocol.address import Address
 from zbridge.protocol.plugin import Simulation, Truth, find_protocol
@@ -205,6 +205,7 @@ class GroundStationScene:
             station("spoken", f"udp://{HOST}:{self.spoken}", to, options=options),
         ]
         self.gateway = self.bench.gateway(device(self.robot.port, protocol, DEVICES[protocol]), *parts, *more)
+        self._withheld, self._pids = Withheld(), [self.gateway.process.pid]
         self.urls = {
             "tcp": f"tcpout://{HOST}:{self.tcp}",
             "udp": f"udpout://{HOST}:{self.udp}",
@@ -216,7 +217,9 @@ class GroundStationScene:
 
     def mavsdk(self, link: str = "tcp", *system: int) -> Mavsdk:
         """Start a program on MAVSDK that connects by ``tcp``, ``udp``, or ``spoken``: by UDP, and we speak first."""
-        return Mavsdk(self.stack, self.urls[link], *system)
+        program = Mavsdk(self.stack, self.urls[link], *system)
+        self._pids.append(program.part.pid)
+        return program
 
     def another(self) -> SimulatedRobot:
         """Begin another robot, r2, whose gateway speaks to the same port of the desk; its system is one more."""
@@ -231,6 +234,11 @@ class GroundStationScene:
     def control(self) -> dict[str, Any]:
         """What the gateway shows of the lease."""
         return self.bench.fleet.last("r1/control")
+
+    @property
+    def withheld_s(self) -> float:
+        """The processor time that was withheld so far from the robot, its gateway and the programs on MAVSDK."""
+        return self._withheld.seconds(self._pids)
 
     def free(self) -> None:
         """Wait until nobody holds the robot."""
@@ -254,9 +262,9 @@ class GroundStationScene:
 
     def stops(self, after: float, within_s: float) -> float:
         """Wait until the robot is told to stand still, and give when; too late, but for a busy machine, is an error."""
-        contended = contended_s()
+        withheld_s = self.withheld_s
         took_s = self.robot.stopped(after, within_s)
-        late_s = contended_s() - contended
+        late_s = self.withheld_s - withheld_s
         assert took_s <= within_s + late_s, f"told to stand still after {took_s:.3f} s, not {within_s} s"
         return took_s
 

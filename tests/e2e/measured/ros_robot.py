@@ -78,7 +78,14 @@ class Scene:
         self.await_robot()
 
     def _router(self) -> zenoh.Session:
-        return zenoh.open(configuration("router", self.router_at))
+        """Open the router, which drops what finds its queue full for a second.
+
+        With 1 ms, as ROS's router has, it loses commands that came during a pause of this process: unlike that router
+        it shares its threads with the robot and all programs of the test.
+        """
+        config = configuration("router", self.router_at)
+        config.insert_json5("transport/link/tx/queue/congestion_control/drop/wait_before_drop", "1000000")
+        return zenoh.open(config)
 
     def await_robot(self) -> None:
         """Wait until the gateway has the robot and it takes commands."""

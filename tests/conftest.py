@@ -1,9 +1,12 @@
 """Marks by folder, and how hypothesis runs here: a machine that is busy with other tests is no failure."""
 
 import asyncio
+import contextlib
+import importlib
 import itertools
 from collections.abc import Callable
 from fnmatch import fnmatch
+from pathlib import Path
 
 import pytest
 import uvloop
@@ -13,6 +16,7 @@ from tests import STATE
 from tests.clock import JumpingLoop
 
 collect_ignore = ["vectors"]  # among them packages with tests of their own
+TESTS = Path(__file__).parent
 _numbers = itertools.count()
 REAL = ("tests/e2e/*", "tests/gateways/*/conformance/*")
 """Where tests take real sockets and real time: scenes on Zenoh, and the judges against plain sockets."""
@@ -26,6 +30,20 @@ for profile, examples in PROFILES.items():
 
 def pytest_configure(config: pytest.Config) -> None:
     settings.load_profile("quick" if config.getoption("markexpr") == "not e2e" else "zbridge")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection(session: pytest.Session) -> None:
+    """Let each worker of a whole run first import its share of the modules: what it compiles the others only read."""
+    config, workerinput = session.config, getattr(session.config, "workerinput", None)
+    if workerinput is None or config.args_source is not pytest.Config.ArgsSource.TESTPATHS:
+        return
+    paths = (path.relative_to(config.rootpath) for path in TESTS.rglob("test_*.py"))
+    names = sorted(path for path in paths if not {*collect_ignore} & {*path.parts})
+    first, workers = int(workerinput["workerid"].removeprefix("gw")), workerinput["workercount"]
+    for name in names[first::workers]:
+        with contextlib.suppress(Exception, pytest.skip.Exception):  # told when it is collected
+            importlib.import_module(".".join(name.with_suffix("").parts))
 
 
 @pytest.fixture(autouse=True)

@@ -12,6 +12,7 @@ import math
 import secrets
 import sys
 import tempfile
+import tomllib
 import webbrowser
 from collections import Counter
 from collections.abc import AsyncIterator, Mapping
@@ -218,6 +219,12 @@ def _how_to_connect(protocol: Protocol, listener: str) -> str:
     return f"zbridge simulate {protocol.name} --hq {listener}" if protocol.simulate_hq is not None else listener
 
 
+def _listener(protocol: Protocol, address: str) -> str:
+    """Write ``[[hq]]``, with the options that ``zbridge init`` writes: some have no default."""
+    options = tomllib.loads(protocol.hq_template).get("hq", {}).get("options", {})
+    return f'[[hq]]\nprotocol = "{protocol.name}"\nlisten = "{address}"\noptions = {as_toml(options)}\n'
+
+
 @contextlib.asynccontextmanager
 async def _open_to_all() -> AsyncIterator[DemoBus]:
     """Open the embedded router, at Zenoh's usual port if that is free."""
@@ -254,7 +261,7 @@ async def _robot(
         if not addresses:
             raise ZbridgeError(f"the {protocol} simulator did not start")
         file = folder / f"{robot}.toml"
-        serving = f'[[hq]]\nprotocol = "{protocol}"\nlisten = "{listener}"\n' if found.hq is not None else ""
+        serving = _listener(found, listener) if found.hq is not None else ""
         file.write_text(
             f'[robot]\nname = "{robot}"\n'
             f'[device]\nprotocol = "{protocol}"\nconnect = {as_toml(addresses)}\noptions = {as_toml(options)}\n'

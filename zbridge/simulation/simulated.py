@@ -1,4 +1,4 @@
-"""A simulated robot of a protocol's author: bytes in, bytes out, and time. Serves it on TCP.
+"""A simulated robot of a protocol's author: bytes in, bytes out, and time. Serves it on TCP, or by datagrams alone.
 
 Knows no protocol. The gateways of this package simulate several clients and links
 (:mod:`zbridge.simulation.simulator`); a robot on a serial line has one of each.
@@ -7,13 +7,16 @@ Knows no protocol. The gateways of this package simulate several clients and lin
 from __future__ import annotations
 
 import asyncio
+import math
 from abc import ABC, abstractmethod
+from collections.abc import Collection
+from typing import Protocol
 
 import msgspec
 
 from zbridge.errors import ConfigError, ProtocolError
 from zbridge.log import Log
-from zbridge.protocol.address import Address
+from zbridge.protocol.address import Address, DatagramAddress
 from zbridge.protocol.plugin import Simulation, Truth
 
 log = Log(__name__)
@@ -23,6 +26,8 @@ STEP_S = 0.01
 _READ = 4096
 _MOST_STEP_S = 0.1
 """Longest step, where this process was paused."""
+SILENT_S = 5.0
+"""Seconds without a datagram after which a client is gone, and another one is served."""
 
 
 class SimulatedRobot(ABC):
@@ -46,9 +51,10 @@ class SimulatedRobot(ABC):
 
 
 async def serve(simulation: Simulation, robot: SimulatedRobot) -> None:
-    """Serve one robot on TCP until cancelled; one client at a time, any more are closed at once.
+    """Serve one robot on TCP, or at a UDP port, until cancelled; one client at a time.
 
-    Raises ConfigError for options that such a robot does not have, OSError if the address cannot be bound.
+    More clients are closed at once; their datagrams are ignored. Raises ConfigError for options that such a robot does
+    not have, OSError if the address cannot be bound.
     """
     if (
         simulation.version
@@ -58,7 +64,15 @@ async def serve(simulation: Simulation, robot: SimulatedRobot) -> None:
         or len(simulation.addresses) > 1
     ):
         raise ConfigError("this simulated robot has one link, and no versions, dialects, datagrams or fragile variant")
-    (address,), writers = simulation.addresses, set[asyncio.StreamWriter]()
+    (address,) = simulation.addresses
+    if isinstance(address, DatagramAddress):
+        await _serve_datagrams(simulation, robot, address)
+    else:
+        await _serve_connections(simulation, robot, address)
+
+
+async def _serve_connections(simulation: Simulation, robot: SimulatedRobot, address: Address) -> None:
+    writers = set[asyncio.StreamWriter]()
 
     async def serve_client(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         if writers:
@@ -87,7 +101,58 @@ async def serve(simulation: Simulation, robot: SimulatedRobot) -> None:
                 writer.close()  # its task ends by itself, and is not cancelled
 
 
-async def _live(simulation: Simulation, robot: SimulatedRobot, writers: set[asyncio.StreamWriter]) -> None:
+async def _serve_datagrams(simulation: Simulation, robot: SimulatedRobot, address: Address) -> None:
+    make, local = (lambda: _DatagramClient(robot)), (address.host, address.port)
+    transport, client = await asyncio.get_running_loop().create_datagram_endpoint(make, local_addr=local)
+    simulation.ready((DatagramAddress(*transport.get_extra_info("sockname")[:2]),))
+    try:
+        await _live(simulation, robot, (client,))
+    finally:
+        transport.close()
+
+
+class _Writer(Protocol):
+    """What takes the robot's bytes."""
+
+    def write(self, data: bytes, /) -> object: ...
+
+
+class _DatagramClient(asyncio.DatagramProtocol):
+    """The client of a UDP port: the first source that sends there, until it is silent for :data:`SILENT_S`."""
+
+    def __init__(self, robot: SimulatedRobot) -> None:
+        self._robot = robot
+        self._clock = asyncio.get_running_loop().time
+        self._source: object = None
+        self._heard_at = -math.inf
+        self._transport: asyncio.DatagramTransport
+
+    def connection_made(self, transport: asyncio.DatagramTransport) -> None:  # type: ignore[override]
+        self._transport = transport
+
+    def datagram_received(self, data: bytes, source: object) -> None:
+        if source != self._source:
+            if self._there:
+                return
+            self._source, self._heard_at = source, self._clock()
+            self.write(self._robot.connected())
+        self._heard_at = self._clock()
+        try:
+            self.write(self._robot.receive(data))
+        except ProtocolError as error:
+            log.debug("datagram_refused", "a datagram is ignored: {error}", error=error)
+
+    def write(self, data: bytes) -> None:
+        """Send to the client, if there is one."""
+        if data and self._there:
+            self._transport.sendto(data, self._source)
+
+    @property
+    def _there(self) -> bool:
+        return self._clock() - self._heard_at < SILENT_S
+
+
+async def _live(simulation: Simulation, robot: SimulatedRobot, writers: Collection[_Writer]) -> None:
     clock = asyncio.get_running_loop().time
     now, lived_s = clock(), 0.0
     while True:

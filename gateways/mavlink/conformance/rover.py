@@ -110,7 +110,14 @@ class JudgedRover:
     @property
     def moving(self) -> bool:
         """Whether it moves or is commanded to."""
-        return any(self._command()) or abs(self.speed) > 0.02 or abs(self.turn) > 0.02
+        return any(self.commanded) or abs(self.speed) > 0.02 or abs(self.turn) > 0.02
+
+    @property
+    def commanded(self) -> tuple[float, float]:
+        """The speed and the turn that it is to reach: m/s; rad/s clockwise."""
+        if not self.armed or self.mode not in (GUIDED, MANUAL, AUTO):
+            return 0.0, 0.0
+        return (_MISSION_M_S, 0.0) if self.mode == AUTO else self._wanted
 
     def choose(self, mode: int) -> None:
         """Change the mode; HEARTBEAT shows it."""
@@ -212,7 +219,7 @@ class JudgedRover:
         passed_s, self._now = min(now - self._now, _MOST_STEP_S) if self._now else 0.0, now
         self._booted = self._booted or now
         self._fail_safe()
-        wanted = self._command()
+        wanted = self.commanded
         gain = min(passed_s / _LAG_S, 1.0)
         self.speed += (wanted[0] - self.speed) * gain
         self.turn += (wanted[1] - self.turn) * gain
@@ -225,12 +232,6 @@ class JudgedRover:
                 if now >= due:
                     self._due[number] = max(due + self._intervals[number], now)
                     self._send(number)
-
-    def _command(self) -> tuple[float, float]:
-        """Return the speed and the turn that it is to reach."""
-        if not self.armed or self.mode not in (GUIDED, MANUAL, AUTO):
-            return 0.0, 0.0
-        return (_MISSION_M_S, 0.0) if self.mode == AUTO else self._wanted
 
     def _fail_safe(self) -> None:
         """End motion of which no more is heard: a target, a stick, the ground station."""

@@ -72,6 +72,7 @@ MAPS: dict[str, dict[str, Any]] = {
     "tcpudp-1.3-udp": {"side": 240},
     "tcpudp-1.4": {"side": 2048, "times": {"part_s": 0.2}},
     "alf": {},
+    "mavlink": {},
     "wc2ec": {},
 }
 """The robots that are measured, and their maps: cells along a side."""
@@ -219,7 +220,7 @@ class Crossing:
             self._stack, self._case.robot, HOST, (), random.randrange(1 << 30), **MAPS[self._case.robot]
         )
         port = free_port()
-        listens = listener("desk", self._kind.protocol, port)
+        listens = listener("desk", self._kind.protocol, port, self._kind.hq)
         file = scene.place(self._name, device(robot.port, self._kind.protocol, self._kind.options), listens)
         self._stack.callback(scene.supervisor.reload)
         self._stack.callback(file.unlink)

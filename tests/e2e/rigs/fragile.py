@@ -22,6 +22,9 @@ from typing import Any, NamedTuple
 
 from gateways.alf.conformance import parser as alf_wire
 from gateways.alf.conformance.fragile_robot import FragileVehicle
+from gateways.mavlink.conformance.fragile_robot import FragileRover
+from gateways.mavlink.conformance.machine import GatewayAsStation
+from gateways.mavlink.conformance.rover import RoverQuirks
 from gateways.tcpudp.conformance import parser as tcpudp_wire
 from gateways.tcpudp.conformance.fragile_robot import FragileRobot
 from gateways.tcpudp.conformance.machine import Quirks
@@ -66,6 +69,10 @@ class Kind(NamedTuple):
     version: str
     options: str = ""
     udp: bool = False
+    lost_s: float = math.inf
+    """Seconds of silence after which the gateway may give its connection up: a rover shows its HEARTBEAT each second."""
+    hq: str = ""
+    """Options of a listener of its protocol."""
 
 
 def package(version: str, udp: bool) -> Kind:
@@ -130,6 +137,17 @@ def controller(dialect: wc2ec_wire.Dialect, told: str) -> Kind:
     return Kind(make, "wc2ec", dialect, f'dialect = "{dialect}"\n{told}')
 
 
+def rover(tells: bool, times: dict[str, float], **options: Any) -> FragileRover:
+    """Make a rover that the first motion arms; it tells the speed that it is to reach, whatever ends it."""
+    quirks = {name: options.pop(name) for name in RoverQuirks.__struct_fields__ if name in options}
+    made = FragileRover(expected=JUDGED, quirks=RoverQuirks(**quirks), **options)
+    followed(made.machine, "step", lambda now: made.machine.commanded[0])
+    return made
+
+
+JUDGED = GatewayAsStation(arms=True, streams=frozenset({24, 74}))
+"""A gateway with :data:`ARMS`, and the streams that it asks for besides those of the protocol page."""
+ARMS = 'arm = "drive"\n'
 ROBOTS = {
     **{
         f"tcpudp-{version}{'-udp' * udp}": package(version, udp)
@@ -138,6 +156,7 @@ ROBOTS = {
     },
     "alf": vehicle("text"),
     "alf-binary": vehicle("binary"),
+    "mavlink": Kind(rover, "mavlink", "guided", ARMS, lost_s=2.0, hq="options = { system_id = 1 }"),
     "wc2ec": controller("deployed", WHEELS),
     "wc2ec-draft": controller("draft", DRAFT),
 }

@@ -1,4 +1,4 @@
-"""A simulated robot of a protocol's author on TCP or UDP: one client at a time, and nothing that a client sends locks it."""
+"""A simulated robot of a protocol's author, on TCP or UDP: one client at a time, and nothing that it sends locks it."""
 
 from __future__ import annotations
 
@@ -37,9 +37,7 @@ class Echo(SimulatedRobot):
 
 
 @contextlib.asynccontextmanager
-async def served(
-    robot: Echo, truths: list[Truth], kind: type[Address] = Address
-) -> AsyncIterator[tuple[str, int]]:
+async def served(robot: Echo, truths: list[Truth], kind: type[Address] = Address) -> AsyncIterator[tuple[str, int]]:
     loop = asyncio.get_running_loop()
     ready: asyncio.Future[tuple[Address, ...]] = loop.create_future()
     faults: list[object] = []

@@ -10,7 +10,7 @@ import asyncio
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Collection
-from typing import Protocol
+from typing import Any, Protocol
 
 import msgspec
 
@@ -123,14 +123,14 @@ class _DatagramClient(asyncio.DatagramProtocol):
     def __init__(self, robot: SimulatedRobot) -> None:
         self._robot = robot
         self._clock = asyncio.get_running_loop().time
-        self._source: object = None
+        self._source: tuple[Any, ...] | None = None
         self._heard_at = -math.inf
         self._transport: asyncio.DatagramTransport
 
     def connection_made(self, transport: asyncio.DatagramTransport) -> None:  # type: ignore[override]
         self._transport = transport
 
-    def datagram_received(self, data: bytes, source: object) -> None:
+    def datagram_received(self, data: bytes, source: tuple[Any, ...]) -> None:
         if source != self._source:
             if self._there:
                 return

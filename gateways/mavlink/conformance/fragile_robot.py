@@ -50,7 +50,8 @@ class FragileRover(FragileServer):
         self.quirks = quirks or RoverQuirks()
         self.rules = StationRules(expected, self._violate)
         self.machine = JudgedRover(self.rules, quirks=self.quirks, system_id=expected.vehicle_id, params=params)
-        self._phase, self._reader = _RoverPhase.LISTENING, MavlinkReader()
+        self._phase, self._numbered = _RoverPhase.LISTENING, expected.numbered
+        self._reader = MavlinkReader(numbered=self._numbered)
         self._chance = Chances(seed)
         self._seqs: Counter[tuple[int, int]] = Counter()
         self._stalled_until = self._garbage_due = 0.0
@@ -94,7 +95,8 @@ class FragileRover(FragileServer):
         return self._conn is None
 
     def _begin(self, conn: socket.socket) -> None:
-        self._phase, self._broken, self._held, self._reader = _RoverPhase.CONNECTED, "", b"", MavlinkReader()
+        self._phase, self._broken, self._held = _RoverPhase.CONNECTED, "", b""
+        self._reader = MavlinkReader(numbered=self._numbered)
         self._seqs.clear()
         self.rules.connected()
         self.machine.connected(time.monotonic())

@@ -49,6 +49,8 @@ class GatewayAsStation(msgspec.Struct, frozen=True, kw_only=True):
     drive: Literal["guided", "manual"] = "guided"
     arms: bool = False
     """Whether the first motion arms (``arm = "drive"``)."""
+    numbered: bool = True
+    """Whether its frames are numbered without a gap; the stop that a supervisor writes in its place is not."""
     streams: frozenset[int] = frozenset()
     """More messages that its options ask for."""
     reaction_s: float = 0.5
@@ -123,8 +125,9 @@ class StationRules:
         self._ordered_s = self._awake_s
 
     def piloted(self, piloted: bool = True) -> None:
-        """Note that somebody else drives: from now on only an ordered stop may change the mode."""
+        """Note that somebody else drives: motion ends, and from now on only an ordered stop may change the mode."""
         self._piloted_s = self._awake_s if piloted else None
+        self._motion_s = None
 
     def step(self, now: float, passed_s: float) -> None:
         """Judge what is overdue. ``now``: monotonic seconds; ``passed_s``: how long the judge listened."""

@@ -162,12 +162,13 @@ class ParsedMavlinkFrame(msgspec.Struct, frozen=True):
 class MavlinkReader(MessageReader[ParsedMavlinkFrame]):
     """Cuts and judges the stream of one connection of a gateway, which writes MAVLink 2 only.
 
-    ``v1``: MAVLink 1 is no problem, nor are sequence numbers: several peers may be behind the link.
+    ``v1``: MAVLink 1 is no problem, nor are sequence numbers: several peers may be behind the link. ``numbered``:
+    whether sequence numbers must have no gap.
     """
 
-    def __init__(self, *, v1: bool = False) -> None:
+    def __init__(self, *, v1: bool = False, numbered: bool = True) -> None:
         super().__init__()
-        self._v1 = v1
+        self._v1, self._numbered = v1, numbered and not v1
         self._seq: int | None = None
 
     def _lost(self, data: bytes) -> str:
@@ -191,7 +192,7 @@ class MavlinkReader(MessageReader[ParsedMavlinkFrame]):
         payload, crc_at = raw[head : head + raw[1]], head + raw[1]
         layout = _BY_NUMBER.get(number)
         problems = self._problems(raw, layout, payload) if layout else [f"unknown message id {number}"]
-        if not self._v1 and self._seq is not None and seq != self._seq:
+        if self._numbered and self._seq is not None and seq != self._seq:
             problems.append(f"sequence number {seq} instead of {self._seq}")
         self._seq = (seq + 1) % 256
         fields: dict[str, Any] = {}

@@ -72,10 +72,10 @@ MAPS: dict[str, dict[str, Any]] = {
     "tcpudp-1.3-udp": {"side": 240},
     "tcpudp-1.4": {"side": 2048, "times": {"part_s": 0.2}},
     "alf": {},
-    "mavlink": {},
+    "mavlink": {"supervised": True},
     "wc2ec": {},
 }
-"""The robots that are measured, and their maps: cells along a side."""
+"""The robots that are measured, and what they are told; side: of a map, in cells."""
 CRASHES = {"hung": signal.SIGUSR1, "frozen": signal.SIGSTOP, "killed": signal.SIGKILL}
 EARLY = (steps.BEFORE_HELLO, steps.AFTER_HELLO, steps.AFTER_GIVEN, steps.AFTER_UP)
 """A successor that dies at one of these has not got the robot: the gateway continues."""

@@ -20,6 +20,8 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
+import msgspec
+
 from gateways.alf.conformance import parser as alf_wire
 from gateways.alf.conformance.fragile_robot import FragileVehicle
 from gateways.mavlink.conformance.fragile_robot import FragileRover
@@ -70,7 +72,7 @@ class Kind(NamedTuple):
     options: str = ""
     udp: bool = False
     lost_s: float = math.inf
-    """Seconds of silence after which the gateway may give its connection up: a rover shows its HEARTBEAT each second."""
+    """Seconds of silence after which the gateway may give its connection up: rovers show a HEARTBEAT each second."""
     hq: str = ""
     """Options of a listener of its protocol."""
 
@@ -137,10 +139,15 @@ def controller(dialect: wc2ec_wire.Dialect, told: str) -> Kind:
     return Kind(make, "wc2ec", dialect, f'dialect = "{dialect}"\n{told}')
 
 
-def rover(tells: bool, times: dict[str, float], **options: Any) -> FragileRover:
-    """Make a rover that the first motion arms; it tells the speed that it is to reach, whatever ends it."""
+def rover(tells: bool, times: dict[str, float], *, supervised: bool = False, **options: Any) -> FragileRover:
+    """Make a rover that the first motion arms; it tells the speed that it is to reach, whatever ends it.
+
+    supervised: its gateway may hang or die, and a supervisor stops it.
+    """
     quirks = {name: options.pop(name) for name in RoverQuirks.__struct_fields__ if name in options}
-    made = FragileRover(expected=JUDGED, quirks=RoverQuirks(**quirks), **options)
+    crashes = {"numbered": False, "heartbeat_s": 3.0, "motion_s": 1.5, "hold_s": 10.0}
+    expected = msgspec.structs.replace(JUDGED, **crashes if supervised else {})
+    made = FragileRover(expected=expected, quirks=RoverQuirks(**quirks), **options)
     followed(made.machine, "step", lambda now: made.machine.commanded[0])
     return made
 

@@ -210,6 +210,7 @@ def silence(bench: Bench, stack: contextlib.ExitStack) -> RoverOnThread:
         until(lambda: scene.fleet.state("silence") != "established", what="the loss")
         assert 1.8 < time.monotonic() - since < 3.0 + 1.5
     scene.rests()
+    assert rover.machine.mode == HOLD, "the last words were a stop"
     rover.machine.heartbeats = True
     scene.established()
     with scene.driven():

@@ -16,7 +16,6 @@ from gateways.mavlink.conformance.parser import NAMES, ParsedMavlinkFrame, targe
 _MODES = {0, 1, 3, 4, 5, 10, 11, 15}
 _FULL_M_S, _FULL_RAD_S, _LAG_S, _MOST_STEP_S = 1.0, 1.0, 0.1, 0.1
 _MISSION_M_S = 0.5
-_GUID_TIMEOUT_S = _RC_OVERRIDE_S = 3.0
 _FAILSAFE_S = 1.5
 _BEAT_S = 1.0
 _ACCEPTED, _UNSUPPORTED, _FAILED = 0, 3, 4
@@ -24,8 +23,8 @@ _WARNING, _CRITICAL = 4, 2
 _DEPLOYED = {
     "FS_GCS_ENABLE": 0.0,
     "FS_GCS_TIMEOUT": 5.0,
-    "GUID_TIMEOUT": _GUID_TIMEOUT_S,
-    "RC_OVERRIDE_TIME": _RC_OVERRIDE_S,
+    "GUID_TIMEOUT": 3.0,
+    "RC_OVERRIDE_TIME": 3.0,
     "PILOT_STEER_TYPE": 0.0,
     "MAV_GCS_SYSID": 255.0,
 }
@@ -236,10 +235,10 @@ class JudgedRover:
     def _fail_safe(self) -> None:
         """End motion of which no more is heard: a target, a stick, the ground station."""
         silent_s = self._now - self._wanted_at
-        if self.mode == GUIDED and self.armed and silent_s > _GUID_TIMEOUT_S:
+        if self.mode == GUIDED and self.armed and silent_s > self.params["GUID_TIMEOUT"]:
             self._wanted, self._wanted_at = (0.0, 0.0), math.inf
-            self.tell("target not received last 3.0secs, stopping", _WARNING)
-        if self.mode == MANUAL and silent_s > _RC_OVERRIDE_S:
+            self.tell(f"target not received last {self.params['GUID_TIMEOUT']:.1f}secs, stopping", _WARNING)
+        if self.mode == MANUAL and silent_s > self.params["RC_OVERRIDE_TIME"]:
             self._wanted = 0.0, 0.0
         lost_s = self._now - self._gcs_at
         if self.params["FS_GCS_ENABLE"] and self.mode != HOLD and lost_s > self.params["FS_GCS_TIMEOUT"] + _FAILSAFE_S:

@@ -65,6 +65,9 @@ RATE_HZ = 25.0
 """Commands of the driver in a second."""
 PATIENCE_S = 4.0
 """Longest wait for rest, and for motion afterwards; after a cut twice its length more: kernels double their waits."""
+ANOTHER_S = 14.0
+"""Seconds until another connection is usable: the robot may not know yet that the one before has ended, and then it
+never answers this one."""
 SHOWN_S = 2.0
 """The shortest cut that `status` and the counter must show."""
 LINK_STALLS = "link_stalls"
@@ -152,6 +155,7 @@ class Sitting:
         self._name = f"{case.robot}-{case.way}-{case.seconds:g}-{numbers[0]}"
         self._rng = random.Random(f"{self._name} {scene.seed}")
         self._patience_s = PATIENCE_S + 2 * case.seconds * (case.way == "cut")
+        self._patience_s += ANOTHER_S * (case.seconds >= self._kind.lost_s)
         self._gateway: Gateway | None = None
 
     def run(self, took: Callable[[Outcome], object]) -> None:

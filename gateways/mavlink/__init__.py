@@ -14,6 +14,7 @@ from typing import Any, cast, get_args
 
 from gateways.mavlink.frames import HEADER, MARKER, frame_end, frame_of, read_frame, write_frame
 from gateways.mavlink.messages import MESSAGES, MavlinkMessage, control, telemetry
+from gateways.mavlink.rover.advice import ADVICE
 from gateways.mavlink.rover.options import RoverOptions
 from gateways.mavlink.station.options import MavlinkHqOptions
 from zbridge.fleet.messages import Drive
@@ -199,6 +200,7 @@ PROTOCOL = Protocol(
         _codec("rover", 1, 1, *(spec.message for spec in MESSAGES.values())),
         _codec("station", 255, 190, *(spec.message for spec in MESSAGES.values())),
     ),
+    advice=ADVICE,
     examples=EXAMPLES,
     plausible={"battery.voltage": (3.0, 100.0), "battery.current": (-200.0, 200.0)},
 )

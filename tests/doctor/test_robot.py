@@ -199,6 +199,18 @@ REASONS = {
         "tcp://10.0.0.7:11001: Connection refused": None,
     },
     "wc2ec": {"connected, but no device was registered within 5 s": "no_device"},
+    "mavlink": {
+        "no HEARTBEAT within 10 s: expected a rover or boat": "no_heartbeat",
+        "no HEARTBEAT but 7 frames of others within 10 s: expected system 1": "only_others",
+        "udp-in://0.0.0.0:14550: no datagram within 5 s": "no_datagram",
+        "vehicle 1 has a PX4 (autopilot 12): only ArduPilot is supported": "px4",
+        "vehicle 1 is of type 2, autopilot 3: expected an ArduRover": "no_rover",
+        "two vehicles have the id 1": "two_vehicles",
+        "nothing came for 3 s": "heartbeat_lost",
+        "MAV_GCS_SYSID is 254: it ignores the sticks of system 255": "other_station",
+        "HOLD was not confirmed: mode MANUAL": "not_held",
+        "GUID_TIMEOUT is 3: it drives on so long if the gateway dies": None,
+    },
 }
 
 

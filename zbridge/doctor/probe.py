@@ -20,6 +20,9 @@ from zbridge.transport import Conversation, ConversationHooks, Link, connect
 
 PROBE_S = 15.0
 """Time limit of a handshake, seconds."""
+VERSION_S = 1.0
+"""Seconds for which a version is waited for that is not agreed in the handshake."""
+LOOK_S = 0.02
 
 
 class Probed(msgspec.Struct, frozen=True):
@@ -48,6 +51,10 @@ async def shake_hands(protocol: Protocol, address: DeviceAddress, options: Any =
         link = await connect(address, conversation)
         async with asyncio.timeout(PROBE_S):
             await settled.wait()
+        for _ in range(round(VERSION_S / LOOK_S)):
+            if session.version or session.over:
+                break
+            await asyncio.sleep(LOOK_S)
     except TimeoutError as error:
         raise LinkError(f"no handshake within {PROBE_S:g} s") from error
     finally:

@@ -20,6 +20,7 @@ from enum import Enum
 from typing import Any, ClassVar
 
 from gateways.mavlink.numbers import RoverMode
+from gateways.mavlink.rover.advice import NOT_HELD
 from zbridge.protocol import Kept, NotReady
 
 ASK_S = 2.0
@@ -163,7 +164,7 @@ class Helm(Kept):
         if self.mode == RoverMode.HOLD:
             self.state, self.warning = HelmState.HELD, None
             return
-        self.warning = f"HOLD was not confirmed: mode {self.mode_name}"
+        self.warning = f"{NOT_HELD}: mode {self.mode_name}"
         if self.mode != self.driving:
             self.state = HelmState.OTHERS
 

@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 from gateways.mavlink.messages.control import AutopilotVersion, CommandLong, ParamRequestRead, ParamValue
 from gateways.mavlink.messages.telemetry import HomePosition
 from gateways.mavlink.numbers import AUTOPILOT, Command
+from gateways.mavlink.rover.advice import OTHER_STATION
 from gateways.mavlink.rover.options import RoverOptions
 from gateways.mavlink.session import MavlinkSession
 from zbridge.protocol import Kept
@@ -155,7 +156,7 @@ def failsafe_warnings(parameters: dict[str, float], options: RoverOptions) -> tu
     warnings += [*_too_long(parameters, "RC_OVERRIDE_TIME"), *_too_long(parameters, "FS_GCS_TIMEOUT")]
     station = parameters.get("MAV_GCS_SYSID", parameters.get("SYSID_MYGCS", options.system_id))
     if station != options.system_id:
-        warnings.append(f"MAV_GCS_SYSID is {station:g}: it ignores the sticks of system {options.system_id}")
+        warnings.append(f"{OTHER_STATION} {station:g}: it ignores the sticks of system {options.system_id}")
     return tuple(warnings)
 
 

@@ -28,6 +28,7 @@ from gateways.mavlink.numbers import (
     Result,
     RoverMode,
 )
+from gateways.mavlink.rover.advice import NO_BEAT, NO_ROVER, ONLY_OTHERS, TWO_VEHICLES, WITH_PX4
 from gateways.mavlink.rover.helm import STOP_S, Helm, HelmState
 from gateways.mavlink.rover.options import RoverOptions
 from gateways.mavlink.rover.requests import AGAIN_S, TRIES, RoverRequests, command_long, failsafe_warnings
@@ -128,8 +129,9 @@ class RoverSession(MavlinkSession[Any]):
 
     def overdue(self) -> str:
         wanted = f"system {self.options.vehicle_id}" if self.options.vehicle_id else "a rover or boat"
-        others = f"; {self.left_out[_OTHERS]} frames of others" if self.left_out[_OTHERS] else ""
-        return f"no HEARTBEAT of {wanted} within {HANDSHAKE_S:g} s{others}"
+        if others := self.left_out[_OTHERS]:
+            return f"{ONLY_OTHERS} {others} frames of others within {HANDSHAKE_S:g} s: expected {wanted}"
+        return f"{NO_BEAT} {HANDSHAKE_S:g} s: expected {wanted}"
 
     def _find(self, system: int, beat: MavlinkHeartbeat, now: float) -> None:
         """Establish the session once it is sure which system is the rover."""
@@ -137,9 +139,9 @@ class RoverSession(MavlinkSession[Any]):
         if system != wanted if wanted is not None else not is_rover:
             self.left_out[_OTHERS] += 1
         elif beat.autopilot == PX4:
-            self.fail(f"vehicle {system} has a PX4 (autopilot 12): only ArduPilot is supported")
+            self.fail(f"vehicle {system} {WITH_PX4} (autopilot 12): only ArduPilot is supported")
         elif not is_rover or beat.autopilot != ARDUPILOT:
-            self.fail(f"vehicle {system} is of type {beat.kind}, autopilot {beat.autopilot}: expected an ArduRover")
+            self.fail(f"vehicle {system} is of type {beat.kind}, autopilot {beat.autopilot}: {NO_ROVER}")
         else:
             self._beats[system] += 1
             if wanted is not None or self._beats[system] >= BEATS:
@@ -154,7 +156,7 @@ class RoverSession(MavlinkSession[Any]):
         self.version = f"{number >> 24}.{number >> 16 & 0xFF}.{number >> 8 & 0xFF}" if number else ""
         uid = (message.uid, message.uid2)
         if self._uid not in (None, uid):
-            self.busy = f"two vehicles have the id {self.vehicle}"
+            self.busy = f"{TWO_VEHICLES} {self.vehicle}"
         self._uid = uid
 
     def _answered(self, message: CommandAck, now: float) -> None:

@@ -301,8 +301,11 @@ class Sitting:
 
     def _drive_again(self) -> None:
         """Drive again, after a neutral: the connection must have survived, and no motion of before may come."""
-        again = len(self._robot.changes)
-        if self.outcome.cause == "killed" or self._driver.process.poll() is not None:
+        again, lost = len(self._robot.changes), self._case.seconds >= self._kind.lost_s
+        if lost:
+            self._driver.kill()
+            waited(lambda: self._status.get("state") == "established", self._patience_s)
+        if lost or self.outcome.cause == "killed" or self._driver.process.poll() is not None:
             self._drive(AGAIN)
         else:
             self._say_again(AGAIN)

@@ -87,7 +87,7 @@ def test_a_link_without_a_rover_says_what_was_heard() -> None:
     session = opened()
     hears(session, STATION, 255, 190)
     session.expire(10.0)
-    assert session.reason == "no HEARTBEAT of a rover or boat within 10 s; 1 frames of others"
+    assert session.reason == "no HEARTBEAT but 1 frames of others within 10 s: expected a rover or boat"
 
 
 def test_others_are_not_translated_obeyed_or_taken_for_the_rover() -> None:

@@ -11,9 +11,13 @@ from typing import Any
 import msgpack
 import pytest
 
+from gateways.mavlink.conformance.fragile_hq import FragileStation
+from gateways.mavlink.conformance.machine import HOLD
+from gateways.mavlink.conformance.vehicle_rules import VehicleTimes
 from tests import captures
 from tests.e2e.conftest import HOST, Bench, device, end, until
 from tests.e2e.measured.hq_judge import Alf, Ec, Program, Tcp
+from tests.e2e.rigs.fragile import ARMS
 from tests.e2e.rigs.hq_scene import playing, pushed, soon
 from tests.ports import free_port
 from tests.views.recording import files
@@ -105,20 +109,45 @@ _BEARINGS = ", ".join(f"ds{number} = {45.0 * number}" for number in range(8))
 _TABLES = ", ".join(f"ds{number} = [[0.0, 0.0], [1000.0, 2.0]]" for number in range(8))
 _SENSORS = {f"ds{number}" for number in range(8)}
 WEBOTS = {*_SENSORS, "left wheel", "right wheel", "lift"}
-_SHOWN = ("t1/map", "t1/pose", "a1/scan", "a1/motion", "w1/devices", *(f"w1/sensor/{name}" for name in _SENSORS))
+ROVER = ("m1/pose", "m1/scan", "m1/battery")
+_SHOWN = (
+    *ROVER,
+    "t1/map",
+    "t1/pose",
+    "a1/scan",
+    "a1/motion",
+    "w1/devices",
+    *(f"w1/sensor/{name}" for name in _SENSORS),
+)
 NEEDED = {f"fleet/{path}" for path in _SHOWN}
 ROBOTS = [
+    ("m1", "mavlink", ARMS),
     ("t1", "tcpudp", ""),
     ("a1", "alf", ""),
     ("w1", "wc2ec", f"scan_range_m = [0.0, 2.0]\nbearings_deg = {{ {_BEARINGS} }}\ntables = {{ {_TABLES} }}\n"),
 ]
 
 
+class GroundStation(Program):
+    """QGroundControl, which looks on."""
+
+    name, protocol, options = "qgc", "mavlink", "options = { system_id = 1 }"
+
+    def __init__(self) -> None:
+        self.judge = FragileStation("qgc", times=VehicleTimes(heartbeat_s=3.0))  # four processes start beside it
+
+    def sees(self, robot: str) -> bool:
+        """Attitude and position of a robot that has a pose, in HOLD; its heartbeat at least."""
+        shown = {row[1] for row in self.judge.received}
+        poses = {"ATTITUDE", "LOCAL_POSITION_NED"} if robot in ("mavlink", "tcpudp-1.3") else {"HEARTBEAT"}
+        return poses <= shown and self.judge.mode == HOLD and not self.judge.armed
+
+
 @pytest.mark.parametrize(("robot", "protocol"), [(robot, protocol) for robot, protocol, _ in ROBOTS])
 async def test_old_programs_of_every_protocol_see_a_replay_as_the_robot_and_none_complains(
     bench: Bench, recording: Path, robot: str, protocol: str
 ) -> None:
-    programs: list[Program] = [Tcp("1.3", udp=True), Alf("text"), Ec()]
+    programs: list[Program] = [Tcp("1.3", udp=True), Alf("text"), Ec(), GroundStation()]
     ports = {program.name: free_port() for program in programs}
     tables = "".join(
         f'[[hq]]\nname = "{one.name}"\nprotocol = "{one.protocol}"\nlisten = "tcp://{HOST}:{ports[one.name]}"\n{one.options}\n'

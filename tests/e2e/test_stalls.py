@@ -11,7 +11,7 @@ import pytest
 from tests.e2e.measured.stalls import LIMIT_S, Case, measure
 from tests.e2e.rigs.processes import NotHereError, apart, module
 
-STALLED = ("alf", "tcpudp-1.3", "wc2ec")
+STALLED = ("alf", "mavlink", "tcpudp-1.3", "wc2ec")
 
 
 def test_robots_that_stall_while_they_are_driven_are_at_rest_after_it() -> None:

@@ -154,6 +154,7 @@ def test_robots_rest_and_stay_usable_whatever_their_gateway_dies_of_and_at_whate
         Case("tcpudp-1.3", "hung"),
         Case("wc2ec", "frozen"),
         Case("alf", "killed"),
+        Case("mavlink", "killed"),
         Case("tcpudp-1.4", f"predecessor {AFTER_GIVEN}"),
         Case("alf", f"successor {AFTER_GO}"),
         Case("tcpudp-1.3-udp", f"again successor {FIRST_READ}"),

@@ -20,6 +20,7 @@ import socket
 import tempfile
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -27,9 +28,11 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from gateways.alf.conformance import parser as alf
+from gateways.mavlink.conformance import machine as mavlink
+from gateways.mavlink.conformance import parser as mavlink_wire
 from gateways.wc2ec.conformance import parser as wc2ec
 from tests.e2e.conftest import HOST, Bench, Gateway, device, until
-from tests.e2e.rigs.fragile import WHEELS
+from tests.e2e.rigs.fragile import ARMS, WHEELS
 from tests.e2e.rigs.processes import Finding, report
 from tests.e2e.rigs.robots import MOVE, ROTATE, SETTINGS, STOP, position
 
@@ -201,7 +204,50 @@ class Controller(Numbered):
         self.moving = any(self._wheels.values())
 
 
-ROBOTS: dict[str, type[Numbered]] = {kind.protocol: kind for kind in (Package, Vehicle, Controller)}
+class Rover(Numbered):
+    """An ArduRover: DISTANCE_SENSOR, whose centimetres are the number, behind a HEARTBEAT."""
+
+    protocol, options, path = "mavlink", ARMS, "sensor/distance_forward"
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._reader = mavlink_wire.MavlinkReader()
+        self._answers: deque[int] = deque()
+        self._mode, self._armed, self._seq = mavlink.HOLD, False, 0
+
+    def message(self, number: int) -> bytes:
+        mode = {"custom_mode": self._mode, "base_mode": 1 | mavlink.ARMED * self._armed}
+        data = self._write("HEARTBEAT", type=10, autopilot=3, **mode)
+        while self._answers:
+            data += self._write("COMMAND_ACK", command=self._answers.popleft())
+        return data + self._write("DISTANCE_SENSOR", current_distance=number, max_distance=65_535)
+
+    def _write(self, name: str, **fields: int) -> bytes:
+        self._seq = (self._seq + 1) % 256
+        return mavlink_wire.write_frame(name, fields, (1, 1), self._seq)
+
+    def number(self, sample: dict[str, Any]) -> int:
+        return round(sample["value"] * 100)
+
+    def hear(self, data: bytes) -> None:
+        for heard in self._reader.take(data):
+            self.commands += 1
+            self.faults += [heard.problem] if heard.problem else []  # also a number that is not the next one
+            if heard.name == "COMMAND_LONG":
+                self._obey(heard.fields)
+            elif heard.name == "SET_POSITION_TARGET_LOCAL_NED":
+                self.moving = heard.fields["vx"] > 0
+
+    def _obey(self, fields: dict[str, Any]) -> None:
+        self._answers.append(fields["command"])
+        if fields["command"] == mavlink.SET_MODE:
+            self._mode = int(fields["param2"])
+            self.moving = self.moving and self._mode != mavlink.HOLD
+        elif fields["command"] == mavlink.ARM:
+            self._armed = fields["param1"] == 1
+
+
+ROBOTS: dict[str, type[Numbered]] = {kind.protocol: kind for kind in (Package, Vehicle, Controller, Rover)}
 
 # Restarts
 

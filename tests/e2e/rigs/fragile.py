@@ -145,7 +145,7 @@ def rover(tells: bool, times: dict[str, float], *, supervised: bool = False, **o
     supervised: its gateway may hang or die, and a supervisor stops it.
     """
     quirks = {name: options.pop(name) for name in RoverQuirks.__struct_fields__ if name in options}
-    crashes = {"numbered": False, "heartbeat_s": 3.0, "motion_s": 1.5, "hold_s": 10.0}
+    crashes = {"numbered": False, "heartbeat_s": 8.0, "motion_s": 1.5, "hold_s": 10.0}
     expected = msgspec.structs.replace(JUDGED, **crashes if supervised else {})
     made = FragileRover(expected=expected, quirks=RoverQuirks(**quirks), params={"GUID_TIMEOUT": 2.0}, **options)
     followed(made.machine, "step", lambda now: made.machine.commanded[0])

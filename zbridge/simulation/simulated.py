@@ -7,6 +7,7 @@ Knows no protocol. The gateways of this package simulate several clients and lin
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Collection
@@ -137,10 +138,8 @@ class _DatagramClient(asyncio.DatagramProtocol):
             self._source, self._heard_at = source, self._clock()
             self.write(self._robot.connected())
         self._heard_at = self._clock()
-        try:
+        with contextlib.suppress(ProtocolError):  # it is lost, as datagrams may be
             self.write(self._robot.receive(data))
-        except ProtocolError as error:
-            log.debug("datagram_refused", "a datagram is ignored: {error}", error=error)
 
     def write(self, data: bytes) -> None:
         """Send to the client, if there is one."""

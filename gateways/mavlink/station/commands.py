@@ -13,7 +13,7 @@ from gateways.mavlink.frames import MavlinkFrame
 from gateways.mavlink.messages.control import CommandAck, CommandInt, CommandLong, MavlinkSetMode
 from gateways.mavlink.numbers import CUSTOM_MODE, Command, Result, RoverMode
 from gateways.mavlink.station.driving import RELEASE, enter, is_deflected
-from gateways.mavlink.station.session import Station
+from gateways.mavlink.station.session import Station, StopNews
 from gateways.mavlink.station.streams import STREAMED
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, Stop
@@ -62,7 +62,7 @@ def hindrance(station: Station, view: RobotView) -> str | None:
         return None
     if control.latches:
         return f"stop {control.latches[-1].described}"
-    if station.now - station.stop_asked_at < STOPPING_S:
+    if station.awaits and station.now - station.stop_asked_at < STOPPING_S:
         return "stopping"
     return f"held by {control.holder}" if is_held(control, station.who) else None
 
@@ -111,9 +111,12 @@ def _terminate(station: Station, message: CommandLong | CommandInt) -> Ordered:
 
 
 def _stop(station: Station) -> Ordered:
-    """Stop the robot, whoever drives it. Until that is shown, nobody arms: it would disarm what was armed since."""
+    """Stop the robot, whoever drives it. Until all news of that came, nobody arms: it would disarm them again."""
+    control = station.vehicle.view.control
     station.rest(station.now)
-    station.stop_asked_at = station.now
+    station.stop_asked_at, station.awaits = station.now, {StopNews.SHOWN}
+    if control is not None and control.holder == station.who:
+        station.awaits.add(StopNews.LEASE_ENDED)  # that takes a question to the robot's gateway
     return Result.ACCEPTED, ((topics.CMD_STOP, Stop(id=secrets.token_bytes(16), who=station.who)),)
 
 

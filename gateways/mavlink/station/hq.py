@@ -5,7 +5,6 @@ Source: "The gateway as vehicle" and "Translation" of the protocol page.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -16,7 +15,7 @@ from gateways.mavlink.station import answers, commands, driving
 from gateways.mavlink.station.driving import RELEASE, VELOCITY_ONLY
 from gateways.mavlink.station.options import MavlinkHqOptions
 from gateways.mavlink.station.parameters import Parameters
-from gateways.mavlink.station.session import Station
+from gateways.mavlink.station.session import Station, StopNews
 from gateways.mavlink.station.vehicle import ShownRover
 from zbridge.fleet.messages import Control, FleetMessage, Text
 from zbridge.fleet.topics import Topic
@@ -91,7 +90,7 @@ class MavlinkHq(HqSide):
             if stopped or commands.is_held(news, session.who):
                 session.rest(now)
             if stopped:
-                session.stop_asked_at = -math.inf
+                session.awaits.discard(StopNews.SHOWN)
 
         return send
 
@@ -108,6 +107,7 @@ class MavlinkHq(HqSide):
 
     def not_driving(self, session: Station, now: float) -> None:
         session.rest(now)
+        session.awaits.discard(StopNews.LEASE_ENDED)
 
     # What they order, and ask for
 

@@ -6,6 +6,7 @@ Source: "The gateway as vehicle" of the protocol page.
 from __future__ import annotations
 
 import math
+from enum import Enum
 from typing import Any, ClassVar
 
 import msgspec
@@ -34,6 +35,13 @@ _STICKS = 64
 _STANDBY, _ACTIVE = 3, 4
 _MAVLINK = 3
 _MOST_TEXT_ID = 65535
+
+
+class StopNews(Enum):
+    """What tells a station that its stop is over: ``control`` shows it, and the client's own lease has ended."""
+
+    SHOWN = "shown"
+    LEASE_ENDED = "lease ended"
 
 
 class SaidMotion(msgspec.Struct):
@@ -78,7 +86,8 @@ class Station(MavlinkSession[MavlinkFrame]):
         self.now = -math.inf
         """When it was read last."""
         self.stop_asked_at = -math.inf
-        """When it asked for a stop that ``control`` has not shown yet."""
+        """When it asked for a stop of which it awaits news."""
+        self.awaits: set[StopNews] = set()
         self._kind = BOAT if options.kind == "boat" else ROVER
         self._beats_at = 0.0
         self._texts = 0

@@ -59,7 +59,7 @@ class MavlinkHq(HqSide):
             return self._control(message)
         if isinstance(message, Text):
             text = message.text
-            return lambda session, now: session.text(text, Severity.INFO)
+            return None if message.kind == "request" else lambda session, now: session.text(text, Severity.INFO)
         ids = self.vehicle.note(message)
         return self._news(ids) if ids else None
 
@@ -98,6 +98,8 @@ class MavlinkHq(HqSide):
         return lambda session, now: session.appear(now, there=there)
 
     def tell(self, session: Station, text: str, now: float) -> None:
+        if session.awaits:  # its own stop, of which it knows
+            return
         for prefix in ("not driving: ", "drive: "):
             text = text.removeprefix(prefix)
         if text.endswith(_CENTRE):

@@ -264,6 +264,7 @@ def test_streams_come_as_often_as_they_were_asked_for() -> None:
 
 def test_texts_of_the_robot_are_shown_in_chunks() -> None:
     scene = Scene()
+    scene.publishes("text", Text("simulated lidar data", kind="request"))  # it is for programs
     scene.publishes("text", Text("a" * 60))
     texts = scene.stations[0].heard("STATUSTEXT")
     assert [(text.severity, len(text.text), text.chunk_seq) for text in texts] == [(6, 50, 0), (6, 10, 1)]
@@ -465,6 +466,7 @@ def test_nobody_arms_until_the_stop_that_they_asked_for_is_shown() -> None:
     scene, ground = guided()
     scene.publishes("control", Control("held", holder="hq.mavlink:5760.1", priority=0))
     ground.mode(HOLD)
+    scene.side.tell(ground.session, "not driving: the lease has ended (stop)", scene.now)
     news = (
         lambda: scene.publishes("control", Control("stopped")),
         lambda: scene.side.not_driving(ground.session, scene.now),  # its lease has ended, which it learns later

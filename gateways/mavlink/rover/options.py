@@ -11,6 +11,8 @@ from zbridge.protocol import Positive
 
 SystemId = Annotated[int, msgspec.Meta(ge=1, le=255)]
 Rate = Annotated[float, msgspec.Meta(ge=0, le=50)]
+SLOWEST_HZ = 0.01
+"""Of a stream that is asked for: the interval is a float, and a vehicle counts it in µs as an integer of 32 bits."""
 
 
 class RoverOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -26,6 +28,11 @@ class RoverOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     position_hz: Rate = 5.0
     ranges_hz: Rate = 5.0
     status_hz: Rate = 1.0
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a rate that is neither 0 nor one a vehicle knows."""
+        if any(0 < rate < SLOWEST_HZ for rate in (self.position_hz, self.ranges_hz, self.status_hz)):
+            raise ValueError(f"position_hz, ranges_hz, status_hz: expected 0, or at least {SLOWEST_HZ:g}")
 
     @property
     def mode(self) -> RoverMode:

@@ -1,7 +1,7 @@
 """What a rover is asked for: streams, its version and home, and the parameters of its failsafes. Sans-IO.
 
 Source: "The gateway as HQ" of the protocol page. An answer to a command names the command only, so one at a time is on
-the wire, :data:`TRIES` times; each time is numbered, as MAVLink has it. Parameters are read, never written.
+the wire, :data:`TRIES` times; each time is numbered, as MAVLink has it. Parameters come last; they are never written.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import math
 from collections import deque
 from typing import Any, ClassVar
 
+from gateways.mavlink.messages import MavlinkMessage
 from gateways.mavlink.messages.control import AutopilotVersion, CommandLong, ParamRequestRead, ParamValue
 from gateways.mavlink.messages.telemetry import HomePosition
 from gateways.mavlink.numbers import AUTOPILOT, Command
@@ -20,7 +21,7 @@ from zbridge.protocol import Kept
 
 AGAIN_S, TRIES = 0.5, 4
 STREAM_S = 5.0
-"""Seconds after which a stream that stopped, or a parameter that did not come, is asked for again."""
+"""Seconds after which a stream that stopped is asked for again."""
 LOOK_S = 1.0
 LONG_S = 2.0
 """A failsafe that takes longer is warned of."""
@@ -36,11 +37,13 @@ PARAMETERS = (
     "SYSID_MYGCS",
 )
 _REQUEST = "request"
+_READ = 0
+"""The number of no command: read a parameter."""
 _US = 1_000_000
 
 
 class RoverRequests(Kept):
-    """The requests of one session. vehicle: the system that is asked."""
+    """The requests of one session."""
 
     kept: ClassVar[dict[str, Any]] = {
         "parameters": dict[str, float],
@@ -50,22 +53,20 @@ class RoverRequests(Kept):
         "_tries": int,
         "_again_at": float,
         "_look_at": float,
-        "_parameters_at": float,
-        "_rounds": int,
     }
 
     def __init__(self, session: MavlinkSession[Any], options: RoverOptions) -> None:
         self._session = session
         self._vehicle = 0
         rates = ((POSITION, options.position_hz), (RANGES, options.ranges_hz), (STATUS, options.status_hz))
-        self._streams = {message_id: rate for ids, rate in rates for message_id in ids if rate}
+        self._streams = {message_id: _US / rate for ids, rate in rates for message_id in ids if rate}
         self.parameters: dict[str, float] = {}
         self.heard: dict[int, float] = {}
         """When a message of an id came last."""
         self._waiting: deque[tuple[int, float, float]] = deque()
-        """Commands with two numbers; the first one is on the wire."""
-        self._tries, self._rounds = 0, 0
-        self._again_at = self._look_at = self._parameters_at = math.inf
+        """Commands with two numbers, or :data:`_READ` with the place of a parameter; the first one is on the wire."""
+        self._tries = 0
+        self._again_at = self._look_at = math.inf
 
     def __repr__(self) -> str:
         return f"<RoverRequests {len(self._waiting)} wait, {len(self.parameters)} parameters>"
@@ -76,26 +77,27 @@ class RoverRequests(Kept):
         return min(self._again_at, self._look_at)
 
     def begin(self, vehicle: int, now: float) -> None:
-        """Ask for all there is."""
-        self._vehicle = vehicle
-        self._look_at, self._parameters_at = now + LOOK_S, now
+        """Ask a vehicle for all there is."""
+        self._vehicle, self._look_at = vehicle, now + LOOK_S
         for wanted in (AutopilotVersion, HomePosition):
             self._waiting.append((Command.REQUEST_MESSAGE, float(wanted.spec.id), 0.0))
         self._waiting.extend(map(self._stream, self._streams))
+        self._waiting.extend((_READ, float(place), 0.0) for place in range(len(PARAMETERS)))
         self._next(now)
-        self._read_parameters(now)
 
     def answered(self, command: int, now: float) -> None:
-        """Go on with the next command if this one is on the wire."""
+        """Go on with the next request if this one is on the wire."""
         if self._waiting and self._waiting[0][0] == command:
             self._waiting.popleft()
             self._next(now)
 
-    def take(self, message: ParamValue) -> None:
+    def take(self, message: ParamValue, now: float) -> None:
         """Note the value of a parameter."""
         name = message.param_id.partition(b"\0")[0].decode("ascii", "replace")
         if name in PARAMETERS and math.isfinite(message.param_value):
             self.parameters[name] = message.param_value
+            if self._waiting and self._waiting[0][:2] == (_READ, PARAMETERS.index(name)):
+                self.answered(_READ, now)
 
     def expire(self, now: float) -> None:
         """Ask again for what did not come."""
@@ -103,7 +105,8 @@ class RoverRequests(Kept):
             self._send(now)
         elif now >= self._again_at:
             command, number, _ = self._waiting.popleft()
-            self._session.left_out[f"command {command} ({number:g}) without an answer"] += 1
+            if command != _READ:  # no vehicle has all parameters
+                self._session.left_out[f"command {command} ({number:g}) without an answer"] += 1
             self._next(now)
         if now >= self._look_at:
             self._look_at = now + LOOK_S
@@ -111,23 +114,15 @@ class RoverRequests(Kept):
 
     def _look(self, now: float) -> None:
         for message_id in self._streams:
-            if now - self.heard.get(message_id, now) > STREAM_S:
+            wanted = self._stream(message_id)
+            if now - self.heard.get(message_id, now) > STREAM_S and wanted not in self._waiting:
                 self.heard[message_id] = now
-                self._waiting.append(self._stream(message_id))
+                self._waiting.append(wanted)
         if self._again_at == math.inf:
             self._next(now)
-        if now >= self._parameters_at:
-            self._read_parameters(now)
-
-    def _read_parameters(self, now: float) -> None:
-        self._rounds += 1
-        self._parameters_at = now + STREAM_S if self._rounds < TRIES else math.inf
-        for name in PARAMETERS:
-            if name not in self.parameters:
-                self._session.send(ParamRequestRead(-1, self._vehicle, AUTOPILOT, name.encode()))
 
     def _stream(self, message_id: int) -> tuple[int, float, float]:
-        return Command.SET_MESSAGE_INTERVAL, float(message_id), float(round(_US / self._streams[message_id]))
+        return Command.SET_MESSAGE_INTERVAL, float(message_id), float(round(self._streams[message_id]))
 
     def _next(self, now: float) -> None:
         self._tries, self._again_at = 0, math.inf
@@ -138,7 +133,9 @@ class RoverRequests(Kept):
 
     def _send(self, now: float) -> None:
         command, number, more = self._waiting[0]
-        request = command_long(command, number, more, self._vehicle, self._tries)
+        request: MavlinkMessage = command_long(command, number, more, self._vehicle, self._tries)
+        if command == _READ:
+            request = ParamRequestRead(-1, self._vehicle, AUTOPILOT, PARAMETERS[int(number)].encode())
         self._session.outbox.set(_REQUEST, (self._session.encode(request),), now)
         self._tries, self._again_at = self._tries + 1, now + AGAIN_S
 

@@ -12,26 +12,41 @@ from typing import Any, ClassVar
 
 from gateways.mavlink.frames import MavlinkFrame, read_frame
 from gateways.mavlink.messages import MavlinkMessage
-from gateways.mavlink.messages.control import AutopilotVersion, CommandAck, CommandLong, ManualControl, ParamValue
+from gateways.mavlink.messages.control import (
+    AutopilotVersion,
+    CommandAck,
+    CommandLong,
+    ManualControl,
+    ParamValue,
+    SetPositionTargetLocalNed,
+)
 from gateways.mavlink.messages.telemetry import MavlinkHeartbeat
 from gateways.mavlink.numbers import (
     ARDUPILOT,
     ARMED,
     AUTOPILOT,
     BOAT,
+    BODY_NED,
     CUSTOM_MODE,
     NO_AUTOPILOT,
     PX4,
     ROVER,
     STATION,
+    VELOCITY_AND_YAW_RATE,
     Command,
     Result,
     RoverMode,
 )
-from gateways.mavlink.rover.advice import NO_BEAT, NO_ROVER, ONLY_OTHERS, TWO_VEHICLES, WITH_PX4
-from gateways.mavlink.rover.helm import STOP_S, Helm, HelmState
+from gateways.mavlink.rover.helm import STOP_S, Helm, HelmAction, HelmState
 from gateways.mavlink.rover.options import RoverOptions
-from gateways.mavlink.rover.requests import AGAIN_S, TRIES, RoverRequests, command_long, failsafe_warnings
+from gateways.mavlink.rover.requests import (
+    AGAIN_S,
+    TRIES,
+    RoverRequests,
+    command_long,
+    failsafe_warnings,
+    mirrors_backward,
+)
 from gateways.mavlink.session import MavlinkSession
 from zbridge.protocol import KEEP_ALIVE, KeepAlive, Limits, Role, State
 
@@ -41,6 +56,7 @@ BEATS = 2
 REPEAT_S = {"guided": 0.2, "manual": 0.1}
 """Seconds after which motion is repeated."""
 STOP_AGAIN_S = 0.2
+FULL_STICK = 1000
 GIVE_BACK = 32767
 """The value of an axis that gives it back to the RC receiver: else the last stick would count for 3 s more."""
 MOTION = "motion"
@@ -62,8 +78,8 @@ class RoverSession(MavlinkSession[Any]):
         "warnings": tuple[str, ...],
         "requests": RoverRequests,
         "_beats": dict[int, int],
+        "_foreign": str,
         "_uid": tuple[int, bytes] | None,
-        "_overrides": bool,
         "_motion": bytes,
     }
 
@@ -72,12 +88,14 @@ class RoverSession(MavlinkSession[Any]):
         self.options, self.helm = options, helm
         self.vehicle = 0
         self.requests = RoverRequests(self, options)
+        self._wanted = options.vehicle_id or helm.vehicle
+        """The only system that is taken; 0: any rover. A process drives the one that it found first."""
         self._beats: Counter[int] = Counter()
+        self._foreign = ""
+        """What was found that is no ArduRover."""
         self._uid: tuple[int, bytes] | None = None
         self._motion = b""
-        """The motion that is wanted; it is sent once the rover shows our mode."""
-        self._overrides = False
-        """Whether a stick of ours may hold the RC receiver's off."""
+        """The motion that is wanted; a stick is sent once the rover shows our mode."""
         self._now = -math.inf
         self._lives = False
         """Whether the rover's HEARTBEAT is among what was just read."""
@@ -96,7 +114,8 @@ class RoverSession(MavlinkSession[Any]):
     def decode(self, frame: bytes) -> MavlinkFrame | MavlinkMessage:
         """Return the message of a frame of the rover, and all other frames as they are."""
         found = read_frame(frame)
-        if found.message is None or found.component != AUTOPILOT or found.system != self.vehicle:
+        of_rover = self.vehicle and (found.system, found.component) == (self.vehicle, AUTOPILOT)
+        if found.message is None or not of_rover:
             return found
         self.requests.heard[found.message_id] = self._now
         return found.message
@@ -111,12 +130,11 @@ class RoverSession(MavlinkSession[Any]):
                 return False
             case MavlinkHeartbeat():
                 self._lives = True
-                self.helm.show(message.custom_mode, armed=bool(message.base_mode & ARMED), now=now)
-                self._follow_helm()
+                self._show(message, now)
             case CommandAck(target_system=target) if target in (0, self.system):
                 self._answered(message, now)
             case ParamValue():
-                self.requests.take(message)
+                self.requests.take(message, now)
                 self._warn()
             case AutopilotVersion():
                 self._identify(message)
@@ -128,43 +146,48 @@ class RoverSession(MavlinkSession[Any]):
             super()._heard(now)
 
     def overdue(self) -> str:
-        wanted = f"system {self.options.vehicle_id}" if self.options.vehicle_id else "a rover or boat"
-        if others := self.left_out[_OTHERS]:
-            return f"{ONLY_OTHERS} {others} frames of others within {HANDSHAKE_S:g} s: expected {wanted}"
-        return f"{NO_BEAT} {HANDSHAKE_S:g} s: expected {wanted}"
+        wanted = f"system {self._wanted}" if self._wanted else "a rover or boat"
+        others = f"; {self.left_out[_OTHERS]} frames of others" if self.left_out[_OTHERS] else ""
+        foreign = f"; {self._foreign}" if self._foreign else ""
+        return f"no HEARTBEAT of {wanted} within {HANDSHAKE_S:g} s{others}{foreign}"
 
     def _find(self, system: int, beat: MavlinkHeartbeat, now: float) -> None:
         """Establish the session once it is sure which system is the rover."""
-        wanted, is_rover = self.options.vehicle_id, beat.kind in (ROVER, BOAT)
-        if system != wanted if wanted is not None else not is_rover:
+        is_rover = beat.kind in (ROVER, BOAT)
+        if not system or (system != self._wanted if self._wanted else not is_rover):
             self.left_out[_OTHERS] += 1
-        elif beat.autopilot == PX4:
-            self.fail(f"vehicle {system} {WITH_PX4} (autopilot 12): only ArduPilot is supported")
-        elif not is_rover or beat.autopilot != ARDUPILOT:
-            self.fail(f"vehicle {system} is of type {beat.kind}, autopilot {beat.autopilot}: {NO_ROVER}")
+        elif beat.autopilot != ARDUPILOT or not is_rover:
+            kind = f"is of type {beat.kind}, autopilot {beat.autopilot}: expected an ArduRover"
+            px4 = f"has a PX4 (autopilot {PX4}): only ArduPilot is supported"
+            self._foreign = f"vehicle {system} {px4 if beat.autopilot == PX4 else kind}"
+            self.left_out[_OTHERS] += 1
+            if self._wanted:
+                self.fail(self._foreign)
         else:
             self._beats[system] += 1
-            if wanted is not None or self._beats[system] >= BEATS:
+            if self._wanted or self._beats[system] >= BEATS:
                 self.vehicle = system
-                self.helm.show(beat.custom_mode, armed=bool(beat.base_mode & ARMED), now=now)
+                self.helm.found(system)
                 self.establish("", ())
                 self.requests.begin(system, now)
-                self._follow_helm()
+                self._show(beat, now)
+
+    def _show(self, beat: MavlinkHeartbeat, now: float) -> None:
+        self._do(self.helm.show(beat.custom_mode, armed=bool(beat.base_mode & ARMED), now=now), now)
 
     def _identify(self, message: AutopilotVersion) -> None:
         number = message.flight_sw_version
         self.version = f"{number >> 24}.{number >> 16 & 0xFF}.{number >> 8 & 0xFF}" if number else ""
         uid = (message.uid, message.uid2)
         if self._uid not in (None, uid):
-            self.busy = f"{TWO_VEHICLES} {self.vehicle}"
+            self.busy = f"two vehicles have the id {self.vehicle}"
         self._uid = uid
 
     def _answered(self, message: CommandAck, now: float) -> None:
         self.requests.answered(message.command, now)
         if message.command in (Command.DO_SET_MODE, Command.ARM):
             what = "arming" if message.command == Command.ARM else f"mode {self.helm.driving.name}"
-            self.helm.answer(what, accepted=message.result == Result.ACCEPTED)
-            self._follow_helm()
+            self._do(self.helm.answer(what, now, accepted=message.result == Result.ACCEPTED), now)
 
     # Time
 
@@ -173,22 +196,7 @@ class RoverSession(MavlinkSession[Any]):
 
     def on_timer(self, now: float) -> None:
         self.requests.expire(now)
-        self.helm.expire(now)
-        self._follow_helm()
-
-    def _follow_helm(self) -> None:
-        """Send nothing more into a mode that is not ours, and nothing that has been confirmed."""
-        state = self.helm.state
-        if state is not HelmState.ASKED:
-            self.outbox.clear(_MODE)
-        if state is HelmState.DRIVING and self._motion and not self.outbox.is_set(MOTION):
-            self._send_motion(self._now)
-        if not self.helm.ours or state is HelmState.HELD:
-            self.outbox.clear(MOTION)
-            if self._overrides and not self.over:
-                self._overrides = False
-                self.send_first(ManualControl(y=GIVE_BACK, z=GIVE_BACK, target=self.vehicle))
-        self._warn()
+        self._do(self.helm.expire(now), now)
 
     def _warn(self) -> None:
         if not self.over:
@@ -197,48 +205,82 @@ class RoverSession(MavlinkSession[Any]):
 
     # Commands
 
-    def drive(self, message: MavlinkMessage, now: float, *, moving: bool) -> None:
-        """Send motion and repeat it, behind a request for our mode where needed; raise NotReady.
+    def drive(self, forward: float, turn: float, now: float) -> None:
+        """Send motion and repeat it, behind a request for our mode where needed; raise NotReady."""
+        action = self.helm.move(now) if forward or turn else self.helm.neutral(now)
+        self._motion = self._steer(forward, turn)
+        self._do(action, now)
 
-        Neutral goes only into a mode that is ours.
-        """
-        if not moving:
-            self._motion = b""
-            if self.helm.release():
-                self.outbox.set(MOTION, (self.encode(message),), now, period_s=REPEAT_S[self.options.drive])
-            return
-        if self.helm.engage(now):
-            asks = [self._mode(self.helm.driving)]
-            if self.helm.arms and not self.helm.armed:
-                asks.append(command_long(Command.ARM, 1.0, 0.0, self.vehicle))
-            until = now + AGAIN_S * (TRIES - 0.5)
-            frames = tuple(map(self.encode, asks))
-            self.outbox.set(_MODE, frames, -math.inf, period_s=AGAIN_S, until=until)  # before the motion
-            self.outbox.clear(MOTION)  # a stop that is repeated
-        self._motion = self.encode(message)
-        if self.helm.state is HelmState.DRIVING or self.options.drive == "guided":
-            self._send_motion(now)
+    def halt(self, now: float, until: float, *, ordered: bool) -> None:
+        """Send a stop, and repeat it until it is confirmed."""
+        self._do(self.helm.stop(now, ordered=ordered), now, until)
 
-    def _send_motion(self, now: float) -> None:
+    def stop_frames(self) -> tuple[bytes, ...]:
+        """Return neutral, then HOLD; HOLD alone where no stick of ours is to be made neutral."""
+        hold = self.encode(self._mode(RoverMode.HOLD))
+        return (hold,) if self._sticks and not self.helm.overrides else (self._steer(0.0, 0.0), hold)
+
+    @property
+    def _sticks(self) -> bool:
+        return self.options.drive == "manual"
+
+    def _do(self, action: HelmAction, now: float, until: float = math.inf) -> None:
+        """Carry out what the helm wants: nothing more goes into a mode that is not ours."""
+        if action is not HelmAction.NOTHING and self.helm.state is not HelmState.ASKED:
+            self.outbox.clear(_MODE)
+        match action:
+            case HelmAction.ASK:
+                self._ask(now)
+                self._move(now)
+            case HelmAction.SEND:
+                self._move(now)
+            case HelmAction.STOP:
+                until = min(until, now + STOP_S)
+                self.outbox.set(MOTION, self.stop_frames(), now, period_s=STOP_AGAIN_S, until=until, urgent=True)
+            case HelmAction.LEAVE | HelmAction.ABANDON:
+                self.outbox.clear(MOTION)
+                if action is HelmAction.ABANDON and not self._sticks:
+                    zero = (self._steer(0.0, 0.0),)
+                    self.outbox.set(MOTION, zero, now, period_s=STOP_AGAIN_S, until=now + STOP_S)
+                if self.helm.overrides and not self.over:
+                    self.helm.overrides = False
+                    self.send_first(ManualControl(y=GIVE_BACK, z=GIVE_BACK, target=self.vehicle))
+        self._warn()
+
+    def _ask(self, now: float) -> None:
+        """Ask for our mode, and to arm where the driver does."""
+        asks = [self._mode(self.helm.driving)]
+        if self.helm.arms and not self.helm.armed:
+            asks.append(command_long(Command.ARM, 1.0, 0.0, self.vehicle))
+        until = now + AGAIN_S * (TRIES - 0.5)
+        self.outbox.clear(MOTION)  # a stop that is repeated
+        self.outbox.set(_MODE, tuple(map(self.encode, asks)), -math.inf, period_s=AGAIN_S, until=until)  # goes first
+
+    def _move(self, now: float) -> None:
         """Send the newest motion, and repeat it.
 
         A stick waits until the rover shows our mode: in the mode of its RC pilot it would be obeyed too. A setpoint is
         ignored outside GUIDED.
         """
-        self._overrides = self.options.drive == "manual"
-        self.outbox.set(MOTION, (self._motion,), now, period_s=REPEAT_S[self.options.drive])
+        if self._motion and not (self._sticks and self.helm.state is HelmState.ASKED):
+            self.helm.overrides = self._sticks
+            self.outbox.set(MOTION, (self._motion,), now, period_s=REPEAT_S[self.options.drive])
 
-    def halt(self, frames: tuple[bytes, ...], now: float, until: float, *, ordered: bool) -> None:
-        """Send a stop, and repeat it until it is confirmed."""
-        self.helm.stop(now, ordered=ordered)
-        self._motion = b""
-        self.outbox.clear(_MODE)
-        until = min(until, now + STOP_S)
-        self.outbox.set(MOTION, frames, now, period_s=STOP_AGAIN_S, until=until, urgent=True)
-
-    def hold(self) -> bytes:
-        """Return the frame that asks for HOLD."""
-        return self.encode(self._mode(RoverMode.HOLD))
+    def _steer(self, forward: float, turn: float) -> bytes:
+        """Make a setpoint, or a stick. Both turn clockwise; a zero has no sign."""
+        if self._sticks:
+            right = turn if forward < 0 and mirrors_backward(self.requests.parameters) else -turn
+            stick = ManualControl(y=round(right * FULL_STICK), z=round(forward * FULL_STICK), target=self.vehicle)
+            return self.encode(stick)
+        setpoint = SetPositionTargetLocalNed(
+            vx=forward * self.options.speed_full_m_s + 0.0,
+            yaw_rate=-turn * self.options.turn_full_rad_s + 0.0,
+            type_mask=VELOCITY_AND_YAW_RATE,
+            target_system=self.vehicle,
+            target_component=AUTOPILOT,
+            coordinate_frame=BODY_NED,
+        )
+        return self.encode(setpoint)
 
     def _mode(self, mode: RoverMode) -> CommandLong:
         return command_long(Command.DO_SET_MODE, float(CUSTOM_MODE), float(mode), self.vehicle)

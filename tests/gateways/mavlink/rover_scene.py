@@ -8,7 +8,7 @@ from gateways.mavlink import PROTOCOL
 from gateways.mavlink.frames import numbered, read_frame
 from gateways.mavlink.messages import MavlinkMessage
 from gateways.mavlink.messages.control import CommandLong
-from gateways.mavlink.numbers import Command, RoverMode
+from gateways.mavlink.numbers import Command, Result, RoverMode
 from gateways.mavlink.simulator import ArduRover
 from zbridge.simulation.scene import Scene
 
@@ -28,6 +28,15 @@ class DeafRover(ArduRover):
             self.deaf[message.command] -= 1
             return
         super()._obey(message, sender)
+
+
+class RefusingRover(ArduRover):
+    """A rover that takes no mode but HOLD from ground stations."""
+
+    def _command(self, message: CommandLong) -> Result:
+        if message.command == Command.DO_SET_MODE and message.param2 != RoverMode.HOLD:
+            return Result.FAILED
+        return super()._command(message)
 
 
 def begin(rover: ArduRover | None = None, **options: Any) -> Scene:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import msgspec
 import pytest
 
 from gateways.mavlink.frames import numbered, write_frame
@@ -15,11 +16,11 @@ from gateways.mavlink.messages.control import (
 )
 from gateways.mavlink.messages.telemetry import Attitude, MavlinkHeartbeat
 from gateways.mavlink.numbers import Command, RoverMode
-from gateways.mavlink.rover.helm import Helm, HelmState
+from gateways.mavlink.rover.helm import Helm, HelmAction, HelmState
 from gateways.mavlink.rover.options import RoverOptions
 from gateways.mavlink.rover.session import RoverSession
 from gateways.mavlink.simulator import ArduRover
-from tests.gateways.mavlink.rover_scene import HOLD, DeafRover, begin, drive, modes, plain, sent
+from tests.gateways.mavlink.rover_scene import HOLD, DeafRover, RefusingRover, begin, drive, modes, plain, sent
 from zbridge.errors import NeutralFirst, NotReady, Unsupported
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, Mode
@@ -32,6 +33,16 @@ STATION = MavlinkHeartbeat(0, 6, 8, 0x80, 4, 3)
 COPTER = MavlinkHeartbeat(0, 2, 3, 1, 4, 3)
 PX4 = MavlinkHeartbeat(0, 10, 12, 1, 4, 3)
 GIMBAL = MavlinkHeartbeat(0, 26, 8, 0, 4, 3)
+
+
+def driven() -> Helm:
+    """Return the helm of rover 1 that we drive since 0.0."""
+    helm = Helm(RoverMode.GUIDED, arms=False)
+    helm.found(1)
+    helm.show(4, armed=True, now=0.0)
+    helm.move(0.0)
+    helm.show(15, armed=True, now=0.1)
+    return helm
 
 
 def opened(**options: int) -> RoverSession:
@@ -73,7 +84,7 @@ def test_a_configured_rover_is_the_only_one() -> None:
 @pytest.mark.parametrize(
     ("beat", "options", "reason"),
     [
-        (PX4, {}, "vehicle 1 has a PX4 (autopilot 12): only ArduPilot is supported"),
+        (PX4, {"vehicle_id": 1}, "vehicle 1 has a PX4 (autopilot 12): only ArduPilot is supported"),
         (COPTER, {"vehicle_id": 1}, "vehicle 1 is of type 2, autopilot 3: expected an ArduRover"),
     ],
 )
@@ -81,6 +92,49 @@ def test_what_is_no_ardurover_is_refused_with_the_reason(beat, options, reason) 
     session = opened(**options)
     hears(session, beat, 1)
     assert (session.state, session.reason) == (State.CLOSED, reason)
+
+
+@pytest.mark.parametrize(
+    ("beat", "what"),
+    [
+        (PX4, "vehicle 9 has a PX4 (autopilot 12): only ArduPilot is supported"),
+        (MavlinkHeartbeat(0, 10, 8, 1, 4, 3), "vehicle 9 is of type 10, autopilot 8: expected an ArduRover"),
+    ],
+)
+def test_a_rover_that_is_no_ardurover_is_named_and_does_not_hide_the_one_beside_it(beat, what: str) -> None:
+    session = opened()
+    hears(session, beat, 9)
+    assert session.state is State.HANDSHAKING
+    session.expire(10.0)
+    assert session.reason == f"no HEARTBEAT of a rover or boat within 10 s; 1 frames of others; {what}"
+    session = opened()
+    for heard, system in ((beat, 9), (ROVER, 1), (beat, 9), (ROVER, 1)):
+        hears(session, heard, system)
+    assert (session.state, session.vehicle) == (State.ESTABLISHED, 1)
+
+
+def test_what_comes_of_system_0_is_not_the_rovers() -> None:
+    session = opened()
+    assert [hears(session, message, 0) for message in (Attitude(yaw=1.0), ROVER, ROVER)] == [[], [], []]
+    assert (session.state, session.helm.mode) == (State.HANDSHAKING, None)
+
+
+def test_a_process_drives_the_rover_that_it_found_first_and_no_other() -> None:
+    scene = begin()
+    drive(scene, 1.0)
+    scene.simulated = ArduRover(system=7)
+    scene.simulated.switch_mode(RoverMode.GUIDED)
+    scene.simulated.switch_arming(True)
+    scene.connect()
+    scene.run(10.1)
+    assert scene.session.reason.startswith("no HEARTBEAT of system 1 within 10 s")
+    assert scene.simulated.mode is RoverMode.GUIDED
+
+
+def test_a_mode_belongs_to_one_vehicle() -> None:
+    helm = driven()
+    helm.found(7)
+    assert (helm.vehicle, helm.ours, helm.mode) == (7, False, None)
 
 
 def test_a_link_without_a_rover_says_what_was_heard() -> None:
@@ -214,9 +268,8 @@ def test_a_refused_arming_is_told_with_the_rovers_own_reason_until_neutral() -> 
     scene.run(0.3)
     with pytest.raises(NotReady, match=r"^arming refused: Arm: Throttle \(RC3\) is not neutral$"):
         scene.drive(0.5)
-    asked = len(modes(scene))
     scene.run(3.0)
-    assert (len(modes(scene)), scene.simulated.truth().neutral) == (asked, True)
+    assert (scene.simulated.mode, modes(scene).count(RoverMode.GUIDED)) == (RoverMode.HOLD, 1)
     scene.simulated.arming_fault = None
     scene.drive(0.0)
     drive(scene, 0.5)
@@ -296,14 +349,12 @@ def test_a_stop_that_is_not_confirmed_ends_after_a_second_and_is_warned_of_until
 def test_a_heartbeat_from_before_the_stop_does_not_confirm_it() -> None:
     helm = Helm(RoverMode.GUIDED, arms=True)
     helm.show(4, armed=True, now=0.0)
-    helm.engage(0.1)
+    helm.move(0.1)
     helm.stop(0.2, ordered=True)
     helm.show(4, armed=True, now=0.25)  # sent before GUIDED was obeyed
-    assert helm.state is HelmState.STOPPING
-    helm.answer("mode", accepted=True)  # of GUIDED
     helm.show(15, armed=True, now=0.3)
     assert helm.state is HelmState.STOPPING
-    helm.show(4, armed=True, now=0.4)
+    helm.show(4, armed=True, now=1.2)
     assert helm.state is HelmState.HELD
 
 
@@ -315,8 +366,114 @@ def test_a_dying_gateway_leaves_a_stop_only_while_it_drives() -> None:
     assert (numbered(hold, 0), scene.robot.helm.state) == (HOLD, HelmState.DRIVING)
     scene.simulated.receive(neutral + hold)
     assert scene.simulated.mode is RoverMode.HOLD
-    scene.run(1.1)  # to the next HEARTBEAT
+    scene.run(2.1)  # to the HEARTBEAT that confirms our own stop
     assert scene.robot.stop_frames() == ()
+    scene.session.fail("gone")
+    assert scene.robot.stop_frames() == ()
+
+
+# Stops of what the rover may be doing by our order
+
+
+def test_a_rover_whose_heartbeats_are_lost_while_we_ask_is_stopped(monkeypatch) -> None:
+    scene = begin()
+    with monkeypatch.context() as lost:
+        lost.setattr(scene.simulated, "send", lambda *messages: None)
+        scene.drive(0.5)
+        scene.run(2.1)
+    with pytest.raises(NotReady, match=r"^mode GUIDED was not shown$"):
+        scene.drive(0.5)
+    scene.run(1.0)
+    assert (scene.simulated.mode, scene.simulated.speed_m_s) == (RoverMode.HOLD, 0.0)
+
+
+def test_a_rover_that_is_disarmed_does_not_drive_on_when_it_is_armed_again() -> None:
+    scene = begin(arm="operator", status_hz=0)
+    scene.simulated.switch_arming(True)
+    scene.run(0.1)
+    drive(scene, 1.0)
+    scene.simulated.switch_arming(False)
+    scene.run(0.6)
+    scene.simulated.switch_arming(True)
+    scene.run(0.5)
+    assert (scene.simulated.mode, scene.simulated.speed_m_s) == (RoverMode.HOLD, 0.0)
+
+
+def test_our_own_hold_that_is_shown_late_is_no_reason_to_send_nothing() -> None:
+    helm = driven()
+    helm.stop(2.0, ordered=False)
+    helm.neutral(2.1)
+    assert helm.move(2.1) is HelmAction.ASK
+    helm.show(15, armed=True, now=2.2)  # of before the stop
+    assert helm.state is HelmState.ASKED
+    helm.show(15, armed=True, now=3.2)
+    assert helm.state is HelmState.DRIVING
+    assert helm.show(4, armed=True, now=3.3) is HelmAction.STOP
+
+
+@pytest.mark.parametrize(("shown_at", "action"), [(3.0, HelmAction.STOP), (9.0, HelmAction.LEAVE)])
+def test_our_mode_that_is_shown_after_a_stop_is_ours_for_some_seconds(shown_at: float, action: HelmAction) -> None:
+    helm = driven()
+    helm.stop(1.0, ordered=False)
+    helm.show(4, armed=True, now=1.1)
+    assert helm.state is HelmState.HELD
+    assert helm.show(15, armed=True, now=shown_at) is action
+
+
+@pytest.mark.parametrize("stops", [False, True])
+@pytest.mark.parametrize("leaves", [False, True])
+def test_a_driver_who_lets_go_takes_no_mode_arms_nothing_and_leaves_the_pilots_stick_alone(stops, leaves) -> None:
+    scene = begin(rover := DeafRover(), drive="manual")
+    rover.deaf = {Command.DO_SET_MODE: 1, Command.ARM: 1} if leaves else {}
+    rover.stick = (0.5, 0.0)
+    rover.switch_mode(RoverMode.STEERING)
+    scene.run(0.1)
+    scene.drive(1.0)
+    if leaves:
+        scene.run(0.1)
+    scene.stop() if stops else scene.drive(0.0)
+    scene.run(3.0)
+    assert sent(scene, ManualControl) == []
+    assert (rover.mode, rover.armed) == (RoverMode.HOLD, False)
+    assert scene.robot.helm.state is HelmState.HELD
+
+
+def test_a_pilot_whose_rover_refuses_our_mode_keeps_it() -> None:
+    scene = begin(rover := RefusingRover(), drive="manual")
+    rover.stick = (0.5, 0.0)
+    rover.switch_mode(RoverMode.STEERING)
+    rover.switch_arming(True)
+    scene.run(0.1)
+    scene.drive(1.0)
+    scene.run(3.0)
+    assert (modes(scene), sent(scene, ManualControl)) == ([RoverMode.MANUAL], [])
+    assert rover.speed_m_s == pytest.approx(0.5)
+
+
+def test_a_warning_of_a_stop_ends_with_the_mode_and_with_the_connection() -> None:
+    helm = driven()
+    helm.stop(1.0, ordered=True)
+    helm.show(0, armed=True, now=2.5)
+    assert helm.warning == "HOLD was not confirmed: mode MANUAL"
+    helm.show(0, armed=True, now=3.5)
+    assert helm.warning
+    helm.show(3, armed=True, now=4.5)
+    assert helm.warning is None
+    helm.stop(5.0, ordered=True)
+    helm.show(3, armed=True, now=6.5)
+    assert helm.warning
+    helm.found(1)
+    assert helm.warning is None
+
+
+def test_what_a_rover_says_later_is_not_why_it_refused() -> None:
+    helm = driven()
+    helm.show(0, armed=True, now=1.0)
+    helm.say("EKF variance")
+    helm.show(0, armed=True, now=2.0)
+    helm.say("target not received last 3.0secs, stopping")
+    with pytest.raises(NotReady, match=r"^mode MANUAL: EKF variance$"):
+        helm.move(2.1)
 
 
 # Others drive it too
@@ -394,6 +551,19 @@ def test_our_last_stick_does_not_hold_the_pilots_off(held: bool) -> None:
     assert scene.simulated.speed_m_s == pytest.approx(-0.4)
 
 
+def test_a_stick_is_given_back_by_the_next_connection_and_by_stops_that_are_latched() -> None:
+    scene = begin(drive="manual")
+    drive(scene, 0.5)
+    scene.simulated.switch_mode(RoverMode.STEERING)
+    scene.connect()
+    scene.establish()
+    assert sent(scene, ManualControl)[-1] == ManualControl(y=32767, z=32767, target=1)
+    for _ in range(3):
+        scene.stop(0.0)
+        scene.run(1.0)
+    assert sent(scene, ManualControl)[-1] == ManualControl(y=32767, z=32767, target=1)
+
+
 def test_a_pilot_may_take_a_rover_that_we_hold() -> None:
     scene = begin()
     drive(scene, 0.5)
@@ -442,6 +612,23 @@ def test_a_stream_that_stops_is_asked_for_again_after_five_seconds() -> None:
     scene.run(2.5)
     (again,) = sent(scene, CommandLong)[len(before) :]
     assert (again.command, again.param1, again.param2) == (511, 30.0, 200000.0)
+
+
+def test_requests_do_not_pile_up_where_nothing_is_answered(monkeypatch) -> None:
+    scene = begin()
+    scene.simulated.connected()  # streams no more
+    send = scene.simulated.send
+    beats = lambda *messages: send(*(each for each in messages if isinstance(each, MavlinkHeartbeat)))  # noqa: E731
+    monkeypatch.setattr(scene.simulated, "send", beats)
+    scene.run(60.0)
+    assert int(repr(scene.session.requests).split()[1]) <= 9
+
+
+@pytest.mark.parametrize("rate", [1e-40, 0.009, -1.0, 51.0])
+def test_rates_are_bounded(rate: float) -> None:
+    with pytest.raises(ValueError, match=r"[Ee]xpected"):
+        msgspec.convert({"position_hz": rate}, RoverOptions)
+    assert msgspec.convert({"position_hz": 0, "ranges_hz": 0.01}, RoverOptions).ranges_hz == 0.01
 
 
 @pytest.mark.parametrize(

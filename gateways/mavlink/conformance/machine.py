@@ -227,15 +227,16 @@ class StationRules:
         if not int(fields["param1"]) & 1:
             self._violate("DO_SET_MODE without the custom mode's bit")
         if mode == HOLD:
-            if not self._zeroed and not (self._expected.drive == "manual" and self._ordered()):
+            if not self._zeroed:
                 self._violate("HOLD without a zero setpoint or a neutral stick before it")
-            if self._shown[0] == HOLD and held_s > self._expected.hold_s and not self._ordered():
+            if self._shown[0] == HOLD and held_s > self._expected.hold_s and not (self._ordered() or self._asking()):
                 self._violate(f"HOLD {held_s:.1f} s after HEARTBEAT showed it")
             self._judge_pilot("HOLD", stops=True)
             self._stopped = True
         elif mode == self._mode:
             self._judge_pilot(f"mode {mode:g}")
-            self._stopped = self._zeroed = False
+            self._stopped = False
+            self._zeroed = self._zeroed and self._expected.drive == "manual"  # where a stick waits for the mode
         else:
             self._violate(f"mode {mode:g}, neither HOLD nor the mode to drive in")
         for (command, number), request in self._requests.items():
@@ -282,7 +283,8 @@ class StationRules:
     def _judge_stick(self, fields: dict[str, Any]) -> None:
         values = fields["y"], fields["z"]
         if values == (_GIVEN_BACK, _GIVEN_BACK) and self._expected.drive == "manual":
-            return  # to the RC receiver
+            self._zeroed, self._motion_s = True, None  # to the RC receiver
+            return
         if not all(-1000 <= value <= 1000 for value in values):
             self._violate(f"a stick of y {values[0]}, z {values[1]}")
         self._stick(any(values))

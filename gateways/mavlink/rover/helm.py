@@ -288,7 +288,8 @@ class Helm(Kept):
             if before is not HelmState.STOPPING:
                 self._ordered = False
                 self._explained = self._explained if before is HelmState.ASKED else ()
-                self._begin(now, in_flight=before is HelmState.ASKED)
+                in_flight = before is HelmState.ASKED and self.driving is RoverMode.GUIDED  # MANUAL alone moves nothing
+                self._begin(now, in_flight=in_flight)
             self._ordered = self._ordered or happened is HelmInput.STOP
         asked = HelmState.ASKED in (before, self.state)
         if action in (HelmAction.ASK, HelmAction.STOP) and (asked or (moved and self.driving is RoverMode.GUIDED)):

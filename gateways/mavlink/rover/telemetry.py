@@ -49,6 +49,7 @@ class RoverTelemetry(Kept):
         "_local": bool,
         "_global_since_ns": int | None,
         "_home": tuple[int, int] | None,
+        "_told_home": bool,
         "_battery": bool,
     }
 
@@ -64,6 +65,8 @@ class RoverTelemetry(Kept):
         """Whether local positions come: global ones would be on other axes."""
         self._global_since_ns: int | None = None
         self._home: tuple[int, int] | None = None
+        self._told_home = False
+        """Whether the home is the rover's own, not its first fix."""
         self._battery = False
         """Whether BATTERY_STATUS comes: SYS_STATUS says less."""
 
@@ -101,8 +104,10 @@ class RoverTelemetry(Kept):
         return self._pose(message.y, message.x, self._yaw, stamp_ns)
 
     def global_position(self, message: telemetry.GlobalPositionInt, stamp_ns: int) -> tuple[Telemetry, ...]:
-        """Show latitude, longitude and altitude; the pose where no local position comes."""
+        """Show latitude, longitude and altitude; the pose where no local position comes. 0, 0 is no position."""
         lat, lon = message.lat, message.lon
+        if not (lat or lon):  # no fix yet
+            return ()
         readings = [_gps("lat", lat / 1e7, stamp_ns), _gps("lon", lon / 1e7, stamp_ns)]
         readings.append(_gps("alt", message.alt / 1000, stamp_ns))
         if self._global_since_ns is None:
@@ -115,8 +120,9 @@ class RoverTelemetry(Kept):
         return (*readings, *self._pose(east, (lat - home_lat) * M_PER_UNIT, yaw, stamp_ns))
 
     def home(self, message: telemetry.HomePosition, stamp_ns: int) -> tuple[Telemetry, ...]:
-        """Note where global positions are measured from, unless they are already from elsewhere."""
-        self._home = self._home or (message.latitude, message.longitude)
+        """Note where global positions are measured from: the first home that is told, not a later one."""
+        if (message.latitude or message.longitude) and not self._told_home:
+            self._home, self._told_home = (message.latitude, message.longitude), True
         return ()
 
     def fix(self, message: telemetry.GpsRawInt, stamp_ns: int) -> tuple[Telemetry, ...]:
@@ -129,7 +135,8 @@ class RoverTelemetry(Kept):
         if message.frame != BODY_FRD or not (math.isfinite(message.angle_offset) and 0 < abs(increment) < 360):
             raise ProtocolError(f"obstacles in frame {message.frame}, {increment:g} degrees apart")
         measured = np.frombuffer(message.distances, np.dtype("<u2"))[: max(1, round(360 / abs(increment)))]
-        ranges = np.where(measured > message.max_distance, np.nan, measured * _M_PER_CM).astype(np.float32)
+        nothing = (measured > message.max_distance) | (measured == UNKNOWN)
+        ranges = np.where(nothing, np.nan, measured * _M_PER_CM).astype(np.float32)
         if increment > 0:
             ranges = ranges[::-1].copy()
             angle_min = -message.angle_offset - increment * (len(ranges) - 1)

@@ -70,6 +70,17 @@ def test_without_a_home_the_first_fix_is_the_origin_and_an_unknown_heading_is_th
     assert shown.take(beyond, at_s=4.0)["pose"].x == pytest.approx(0.0222, abs=1e-3)
 
 
+def test_a_position_before_the_first_fix_is_none_and_a_home_that_is_told_replaces_a_first_fix() -> None:
+    shown, here = Shown(), telemetry.GlobalPositionInt(lat=473977420, lon=85455940, hdg=0)
+    assert shown.take(telemetry.GlobalPositionInt(hdg=0), telemetry.HomePosition()) == {}
+    shown.take(here)
+    assert shown.take(here, at_s=3.0)["pose"].x == pytest.approx(0.0)
+    shown.take(telemetry.HomePosition(473977420 - 1000, 85455940))
+    assert shown.take(here, at_s=4.0)["pose"].y == pytest.approx(11.132, abs=1e-3)
+    shown.take(telemetry.HomePosition(473977420, 85455940))  # of another arming
+    assert shown.take(here, at_s=5.0)["pose"].y == pytest.approx(11.132, abs=1e-3)
+
+
 def test_motion_is_a_fraction_of_full_speed_with_the_gyro_turned_to_our_axes() -> None:
     shown = Shown(speed_full_m_s=2.0)
     motion = shown.take(
@@ -91,6 +102,11 @@ def test_obstacles_are_turned_counter_clockwise() -> None:
     }
     assert known == {0: 1.0, -5: 2.0}
     assert (len(scan.ranges), scan.range_min, scan.range_max) == (72, 0.2, 8.0)
+
+
+def test_an_unknown_distance_is_unknown_whatever_the_range() -> None:
+    scan = Shown().take(telemetry.ObstacleDistance(0, words(100, count=72), 20, 65535, increment=5, frame=12))["scan"]
+    assert np.isnan(scan.ranges).sum() == 71
 
 
 def test_obstacles_in_another_frame_or_without_an_angle_are_no_scan() -> None:

@@ -49,8 +49,7 @@ class HelmState(StrEnum):
 class HelmInput(Enum):
     """What the driver wants, or the rover shows.
 
-    ASTRAY: nobody drives it, and its mode is ours, or may become so. TAKEN: its mode is somebody else's. REFUSED: it
-    has not taken our mode.
+    ASTRAY: nobody drives it, and its mode is ours, or may become so. TAKEN: its mode is, or remains, somebody else's.
     """
 
     MOTION = "motion"
@@ -61,7 +60,6 @@ class HelmInput(Enum):
     HOLDING = "holding"
     ASTRAY = "astray"
     TAKEN = "taken"
-    REFUSED = "refused"
 
 
 class HelmAction(Enum):
@@ -101,7 +99,7 @@ TABLE: dict[HelmState, HelmRow] = {
         HelmInput.MOTION: (HelmAction.SEND, HelmState.ASKED),
         HelmInput.NEUTRAL: _STOPS,
         HelmInput.DRIVEN: (HelmAction.SEND, HelmState.DRIVING),
-        HelmInput.REFUSED: (HelmAction.ABANDON, HelmState.OTHERS),
+        HelmInput.TAKEN: (HelmAction.ABANDON, HelmState.OTHERS),  # our request may be on its way
     },
     HelmState.DRIVING: _WHILE_OURS,
     HelmState.STOPPING: {
@@ -224,7 +222,7 @@ class Helm(Kept):
         """Note the answer to a request for a mode, or to arm (``what``, for people)."""
         if self.state is not HelmState.ASKED or accepted:
             return HelmAction.NOTHING
-        happened = HelmInput.ASTRAY if self.mode == self.driving else HelmInput.REFUSED
+        happened = HelmInput.ASTRAY if self.mode == self.driving else HelmInput.TAKEN
         return self._handle(happened, now, f"{what} refused")
 
     def say(self, text: str) -> None:
@@ -240,7 +238,7 @@ class Helm(Kept):
             return self._handle(HelmInput.ASTRAY, now, "disarmed")
         if self.mode == self.driving or self._shown_at < self._since + FLIGHT_S:
             return self._handle(HelmInput.ASTRAY, now, f"mode {self.driving.name} was not shown")
-        return self._handle(HelmInput.REFUSED, now, f"mode {self.mode_name}")
+        return self._handle(HelmInput.TAKEN, now, f"mode {self.mode_name}")
 
     def _meaning(self, now: float, *, late: bool) -> HelmInput | None:
         """Return what the mode that was just shown means. late: a stop should be over."""

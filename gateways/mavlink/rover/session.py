@@ -56,6 +56,8 @@ BEATS = 2
 REPEAT_S = {"guided": 0.2, "manual": 0.1}
 """Seconds after which motion is repeated."""
 STOP_AGAIN_S = 0.2
+ABANDON_S = 0.5
+"""Seconds for which zero setpoints follow a request for our mode that may still arrive."""
 FULL_STICK = 1000
 GIVE_BACK = 32767
 """The value of an axis that gives it back to the RC receiver: else the last stick would count for 3 s more."""
@@ -241,7 +243,7 @@ class RoverSession(MavlinkSession[Any]):
                 self.outbox.clear(MOTION)
                 if action is HelmAction.ABANDON and not self._sticks:
                     zero = (self._steer(0.0, 0.0),)
-                    self.outbox.set(MOTION, zero, now, period_s=STOP_AGAIN_S, until=now + STOP_S)
+                    self.outbox.set(MOTION, zero, now, period_s=STOP_AGAIN_S, until=now + ABANDON_S)
                 if self.helm.overrides and not self.over:
                     self.helm.overrides = False
                     self.send_first(ManualControl(y=GIVE_BACK, z=GIVE_BACK, target=self.vehicle))

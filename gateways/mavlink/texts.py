@@ -6,6 +6,7 @@ The id 0 is a text in one chunk.
 
 from __future__ import annotations
 
+import math
 from typing import Any, ClassVar, NamedTuple
 
 from gateways.mavlink.messages.telemetry import Statustext
@@ -13,7 +14,7 @@ from zbridge.protocol import Kept
 
 CHUNK_BYTES = 50
 MOST_CHUNKS = 16
-"""Chunks of one text; what is longer is cut off."""
+"""Chunks of one text; what is longer is cut off: the last one has a zero at its end, too."""
 MOST_TEXTS = 4
 """Texts of which chunks may be missing; the oldest gives way, as it is."""
 GAP = "..."
@@ -41,10 +42,13 @@ def chunks_of(text: str, severity: int, text_id: int) -> tuple[Statustext, ...]:
         return (Statustext(severity, first),)
     chunks: list[Statustext] = []
     while text and len(chunks) < MOST_CHUNKS:
-        chunk = clip(text)
+        last = len(chunks) == MOST_CHUNKS - 1
+        chunk = clip(text, CHUNK_BYTES - last)
         text = text[len(chunk.decode()) :]
-        chunks.append(Statustext(severity, chunk.ljust(CHUNK_BYTES) if text else chunk, text_id, len(chunks)))
-    if len(chunks[-1].text) == CHUNK_BYTES and len(chunks) < MOST_CHUNKS:  # nothing says yet that it is the last one
+        chunks.append(
+            Statustext(severity, chunk.ljust(CHUNK_BYTES) if text and not last else chunk, text_id, len(chunks))
+        )
+    if len(chunks[-1].text) == CHUNK_BYTES:  # nothing says yet that it is the last one
         chunks.append(Statustext(severity, b"", text_id, len(chunks)))
     return tuple(chunks)
 
@@ -52,45 +56,36 @@ def chunks_of(text: str, severity: int, text_id: int) -> tuple[Statustext, ...]:
 class TextJoiner(Kept):
     """Joins the chunks of one sender's texts."""
 
-    kept: ClassVar[dict[str, Any]] = {"_chunks": list[tuple[int, int, int, bytes]]}
+    kept: ClassVar[dict[str, Any]] = {"_texts": dict[int, dict[int, tuple[int, bytes]]]}
 
     def __init__(self) -> None:
-        self._chunks: list[tuple[int, int, int, bytes]] = []
-        """Id, number, severity and bytes of each chunk whose text is not whole, as they came."""
+        self._texts: dict[int, dict[int, tuple[int, bytes]]] = {}
+        """Severity and bytes of each chunk by its number, of each text that is not whole by its id, as they came."""
 
     def __repr__(self) -> str:
-        return f"<TextJoiner {len(self._chunks)} chunks wait>"
+        return f"<TextJoiner {len(self._texts)} texts wait>"
 
     def take(self, message: Statustext) -> tuple[JoinedText, ...]:
-        """Return the texts that this chunk completes, and one that gives way to it."""
+        """Return the text that this chunk completes, or one that gives way to it."""
         if not message.text_id:
             return (JoinedText(message.severity, _decoded(message.text)),)
-        self._chunks.append((message.text_id, message.chunk_seq, message.severity, message.text))
-        waiting = list(dict.fromkeys(chunk[0] for chunk in self._chunks))
-        done = [text_id for text_id in waiting if self._is_whole(text_id)]
-        if not done and len(waiting) > MOST_TEXTS:
-            done = waiting[:1]
-        return tuple(self._join(text_id) for text_id in done)
+        chunks = self._texts.setdefault(message.text_id, {})
+        chunks[message.chunk_seq] = message.severity, message.text
+        last = min((number for number, (_, chunk) in chunks.items() if not _goes_on(chunk)), default=math.inf)
+        if sum(number <= last for number in chunks) > last or len(chunks) >= MOST_CHUNKS:
+            return (_join(self._texts.pop(message.text_id)),)
+        if len(self._texts) > MOST_TEXTS:
+            return (_join(self._texts.pop(next(iter(self._texts)))),)
+        return ()
 
-    def _of(self, text_id: int) -> dict[int, tuple[int, bytes]]:
-        return {number: (severity, chunk) for each, number, severity, chunk in self._chunks if each == text_id}
 
-    def _is_whole(self, text_id: int) -> bool:
-        """Return whether the last chunk and all before it have come, or as many as are joined."""
-        chunks = self._of(text_id)
-        last = min((number for number, (_, chunk) in chunks.items() if not _goes_on(chunk)), default=None)
-        whole = last is not None and all(number in chunks for number in range(last))
-        return whole or sum(each[0] == text_id for each in self._chunks) >= MOST_CHUNKS
-
-    def _join(self, text_id: int) -> JoinedText:
-        chunks = self._of(text_id)
-        severity = next(severity for each, _, severity, _ in self._chunks if each == text_id)
-        self._chunks = [chunk for chunk in self._chunks if chunk[0] != text_id]
-        pieces, before = [], -1
-        for number, (_, chunk) in sorted(chunks.items()):
-            pieces.append((b"" if number == before + 1 else GAP.encode()) + chunk.partition(b"\0")[0])
-            before = number
-        return JoinedText(severity, _decoded(b"".join(pieces)))
+def _join(chunks: dict[int, tuple[int, bytes]]) -> JoinedText:
+    pieces, due = [], 0
+    for number, (_, chunk) in sorted(chunks.items()):
+        pieces.append((b"" if number == due else GAP.encode()) + chunk.partition(b"\0")[0])
+        due = number + 1
+    severity, _ = next(iter(chunks.values()))
+    return JoinedText(severity, _decoded(b"".join(pieces)))
 
 
 def _goes_on(chunk: bytes) -> bool:

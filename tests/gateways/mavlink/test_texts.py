@@ -31,8 +31,16 @@ def test_no_chunk_has_half_a_character() -> None:
 
 
 def test_a_text_without_end_is_cut() -> None:
-    assert len(chunks_of("x" * 5000, 6, 1)) == MOST_CHUNKS
-    assert join(chunks_of("x" * 5000, 6, 1)) == ["x" * 800]
+    for size in (800, 5000):
+        chunks = chunks_of("x" * size, 6, 1)
+        assert [len(chunk.text) for chunk in chunks] == [50] * (MOST_CHUNKS - 1) + [49]
+        assert join(chunks) == ["x" * 799]
+    assert join(chunks_of("x" * 750, 6, 1)) == ["x" * 750]
+
+
+def test_chunks_that_never_end_are_shown_all_the_same() -> None:
+    chunks = tuple(Statustext(6, b"x" * 50, 1, number) for number in range(MOST_CHUNKS))
+    assert join(chunks) == ["x" * 800]
 
 
 def test_chunks_of_several_texts_may_come_in_any_order() -> None:

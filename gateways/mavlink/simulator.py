@@ -7,7 +7,6 @@ from ``MAV_GCS_SYSID``. A ground station that is wrong is ignored in silence whe
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,11 @@ from gateways.mavlink import numbers
 from gateways.mavlink.frames import LIMIT_BYTES, MavlinkFrame, frame_end, read_frame, write_frame
 from gateways.mavlink.messages import MavlinkMessage, control, telemetry
 from gateways.mavlink.numbers import FORCE_ARM, STATION, Command, Result, RoverMode, Severity
+from gateways.mavlink.station.options import MavlinkHqOptions, Origin
+from gateways.mavlink.station.vehicle import ShownRover
 from gateways.mavlink.texts import chunks_of
+from zbridge.fleet.messages import Battery, Motion, Pose, Scan
+from zbridge.fleet.view import RobotView
 from zbridge.protocol import ProtocolError, Simulation, Truth
 from zbridge.simulation import SimulatedRobot, serve
 from zbridge.simulation.world import Body, cast
@@ -30,15 +33,14 @@ GIVEN_BACK = 32767
 ACCELERATION_M_S2, COAST_M_S2 = 4.0, 1.5
 RADIUS_M = 0.25
 POINTS, RANGE_CM, NEAR_CM = 72, 800, 20
-HOME_LAT, HOME_LON, ALT_MM = 473977420, 85455940, 488000
-FULL_MV, EMPTY_MV, EMPTY_S = 12600.0, 10500.0, 7200.0
+HOME = Origin(47.397742, 8.545594, 488.0)
+FULL_V, EMPTY_V, EMPTY_S = 12.6, 10.5, 7200.0
 STEADY_HZ = 20.0
 """Most often that a stream is sent."""
 IGNORED = 0x1C0 | 0x07
 """Bits of ``type_mask`` that must be set: acceleration and position are not followed."""
 _VELOCITY, _YAW_RATE, _YAW = 0x08 | 0x10, 0x800, 0x400
 _STEERED = (RoverMode.MANUAL, RoverMode.ACRO, RoverMode.STEERING)
-_M_PER_UNIT = 0.011131884502145034
 PARAMETERS = {
     "FS_GCS_ENABLE": 0.0,
     "FS_GCS_TIMEOUT": 5.0,
@@ -77,6 +79,9 @@ class ArduRover(SimulatedRobot):
         self._due: dict[int, float] = {}
         self.speed_m_s = self.turn_rad_s = 0.0
         self._silent = False
+        self._view = RobotView()
+        told = MavlinkHqOptions(system, speed_full_m_s=FASTEST_M_S, turn_full_rad_s=FASTEST_RAD_S, origin=HOME)
+        self._told = ShownRover(told, self._view)
 
     # As its pilot, and its failures
 
@@ -129,7 +134,7 @@ class ArduRover(SimulatedRobot):
         for message_id, interval_s in self._intervals.items():
             if self._now >= self._due[message_id]:
                 self._due[message_id] = self._now + interval_s - 1e-6
-                self.send(_STREAMS[message_id](self))
+                self._tell(message_id)
         if self._now >= self._beat_at:
             self._beat()
             self._beat_at = self._now + 1.0 - 1e-6
@@ -161,15 +166,15 @@ class ArduRover(SimulatedRobot):
             case control.SetPositionTargetLocalNed() if self.mode is RoverMode.GUIDED:
                 self._follow(message)
             case control.ParamRequestRead():
-                self._tell(message.param_id.partition(b"\0")[0].decode("ascii", "replace"))
+                self._tell_parameter(message.param_id.partition(b"\0")[0].decode("ascii", "replace"))
             case control.ParamRequestList():
                 for name in self.parameters:
-                    self._tell(name)
+                    self._tell_parameter(name)
             case control.CommandLong():
                 result = self._command(message)
                 self.send(control.CommandAck(message.command, result, target_system=sender))
 
-    def _tell(self, name: str) -> None:
+    def _tell_parameter(self, name: str) -> None:
         if name in self.parameters:
             index, count = list(self.parameters).index(name), len(self.parameters)
             self.send(control.ParamValue(self.parameters[name], count, index, name.encode(), 9))
@@ -199,10 +204,10 @@ class ArduRover(SimulatedRobot):
                 return self._arm(message.param1 == 1.0, forced=message.param2 == FORCE_ARM)
             case Command.SET_MESSAGE_INTERVAL:
                 return self._set_interval(int(message.param1), message.param2)
-            case Command.REQUEST_MESSAGE if int(message.param1) in _STREAMS:
-                self.send(_STREAMS[int(message.param1)](self))
+            case Command.REQUEST_MESSAGE:
+                return Result.ACCEPTED if self._tell(int(message.param1)) else Result.UNSUPPORTED
             case Command.GET_HOME_POSITION:
-                self.send(_STREAMS[242](self))
+                self._tell(telemetry.HomePosition.spec.id)
             case _:
                 return Result.UNSUPPORTED
         return Result.ACCEPTED
@@ -217,7 +222,7 @@ class ArduRover(SimulatedRobot):
         return Result.ACCEPTED
 
     def _set_interval(self, message_id: int, interval_us: float) -> Result:
-        if message_id not in _STREAMS:
+        if self.measure(message_id) is None:
             return Result.FAILED
         if interval_us > 0:
             self._intervals[message_id] = max(1 / STEADY_HZ, interval_us / 1e6)
@@ -268,69 +273,31 @@ class ArduRover(SimulatedRobot):
 
     # What it measures
 
-    @property
-    def yaw(self) -> float:
-        """Clockwise from north, rad."""
-        return math.remainder(math.pi / 2 - self.body.heading, 2 * math.pi)
+    def measure(self, message_id: int) -> MavlinkMessage | None:
+        """Return what it measures, or knows of itself, as the message of an id; None: it has no such message."""
+        body, stamp_ns = self.body, round(self._now * 1e9)
+        if message_id == telemetry.DistanceSensor.spec.id:
+            ahead_cm = round(float(self._ranges(np.zeros(1))[0]) * 100)
+            return telemetry.DistanceSensor(round(self._now * 1000), NEAR_CM, RANGE_CM, ahead_cm)
+        view, gyro = self._view, (0.0, 0.0, self.turn_rad_s)
+        view.pose = Pose(body.x, body.y, body.heading, stamp_ns=stamp_ns)
+        view.motion = Motion(speed=self.speed_m_s / FASTEST_M_S, gyro=gyro, stamp_ns=stamp_ns)
+        if message_id == telemetry.ObstacleDistance.spec.id:
+            step, limits = 2 * math.pi / POINTS, (NEAR_CM / 100, RANGE_CM / 100)
+            ranges = self._ranges(-math.pi + np.arange(POINTS) * step).astype(np.float32)
+            view.scan = Scan(-math.pi, step, *limits, ranges, stamp_ns=stamp_ns)
+        level = 1 - min(1.0, self._now / EMPTY_S)
+        self._told.note(Battery(level, EMPTY_V + (FULL_V - EMPTY_V) * level, -1.5))
+        return self._told.message(message_id)
 
-    @property
-    def ms(self) -> int:
-        """Since it was switched on."""
-        return round(self._now * 1000)
+    def _tell(self, message_id: int) -> bool:
+        message = self.measure(message_id)
+        self.send(*([message] if message is not None else []))
+        return message is not None
 
-    @property
-    def percent(self) -> int:
-        """What is left in its battery."""
-        return round(100 * (1 - min(1.0, self._now / EMPTY_S)))
-
-    @property
-    def millivolts(self) -> int:
-        """Of its battery."""
-        return round(EMPTY_MV + (FULL_MV - EMPTY_MV) * self.percent / 100)
-
-
-def _global_position(rover: ArduRover) -> MavlinkMessage:
-    lat = HOME_LAT + round(rover.body.y / _M_PER_UNIT)
-    lon = HOME_LON + round(rover.body.x / _M_PER_UNIT / math.cos(math.radians(HOME_LAT / 1e7)))
-    hdg = round(math.degrees(rover.yaw) * 100) % 36000
-    return telemetry.GlobalPositionInt(rover.ms, lat, lon, ALT_MM, hdg=hdg)
-
-
-def _ranges_cm(rover: ArduRover, clockwise: Any) -> Any:
-    """Measure along angles from ahead, rad; one more than the range where there is nothing."""
-    metres = cast(rover.body.x, rover.body.y, rover.body.heading - clockwise, RANGE_CM / 100 + 0.01)
-    return np.rint(metres * 100).astype("<u2")
-
-
-def _obstacles(rover: ArduRover) -> MavlinkMessage:
-    around = _ranges_cm(rover, np.radians(-180.0 + np.arange(POINTS) * 360.0 / POINTS)).tobytes()
-    limits, step = (NEAR_CM, RANGE_CM), 360.0 / POINTS
-    return telemetry.ObstacleDistance(
-        rover.ms * 1000, around, *limits, 0, round(step), step, angle_offset=-180.0, frame=numbers.BODY_FRD
-    )
-
-
-def _battery(rover: ArduRover) -> MavlinkMessage:
-    cells = np.array([rover.millivolts, *(9 * [65535])], "<u2").tobytes()
-    return telemetry.BatteryStatus(voltages=cells, current_battery=150, battery_remaining=rover.percent)
-
-
-_STREAMS: dict[int, Callable[[ArduRover], MavlinkMessage]] = {
-    1: lambda rover: telemetry.SysStatus(
-        voltage_battery=rover.millivolts, current_battery=150, battery_remaining=rover.percent
-    ),
-    24: lambda rover: telemetry.GpsRawInt(rover.ms * 1000, HOME_LAT, HOME_LON, ALT_MM, fix_type=3),
-    30: lambda rover: telemetry.Attitude(rover.ms, yaw=rover.yaw, yawspeed=-rover.turn_rad_s),
-    32: lambda rover: telemetry.LocalPositionNed(rover.ms, rover.body.y, rover.body.x),
-    33: _global_position,
-    74: lambda rover: telemetry.VfrHud(groundspeed=abs(rover.speed_m_s)),
-    132: lambda rover: telemetry.DistanceSensor(rover.ms, NEAR_CM, RANGE_CM, int(_ranges_cm(rover, np.zeros(1))[0])),
-    147: _battery,
-    148: lambda rover: control.AutopilotVersion(uid=0x1234, flight_sw_version=4 << 24 | 5 << 16 | 1 << 8 | 255),
-    242: lambda rover: telemetry.HomePosition(HOME_LAT, HOME_LON, ALT_MM),
-    330: _obstacles,
-}
-"""What it measures, or knows of itself, by the id of the message."""
+    def _ranges(self, angles: Any) -> Any:
+        """Measure along angles from ahead, rad; m, more than the range where there is nothing."""
+        return cast(self.body.x, self.body.y, self.body.heading + angles, RANGE_CM / 100 + 0.01)
 
 
 async def simulate(simulation: Simulation) -> None:

@@ -82,7 +82,8 @@ def _seal(frame: bytes) -> bytes:
     return frame_of(message_id, payload, MESSAGES[message_id].crc_extra, head[4], head[5], head[6])
 
 
-def _codec(name: str, system: int, component: int, *messages: object) -> Codec:
+def _codec(name: str, system: int, component: int) -> Codec:
+    messages = tuple(spec.message for spec in MESSAGES.values())
     write = partial(write_frame, seq=0, system=system, component=component)
     return Codec(name, write, _read, frame_end, messages, _seal)
 
@@ -196,10 +197,7 @@ PROTOCOL = Protocol(
     simulate_hq=_simulate_hq,
     template=TEMPLATE,
     hq_template=HQ_TEMPLATE,
-    codecs=(
-        _codec("rover", 1, 1, *(spec.message for spec in MESSAGES.values())),
-        _codec("station", 255, 190, *(spec.message for spec in MESSAGES.values())),
-    ),
+    codecs=(_codec("rover", 1, 1), _codec("station", 255, 190)),
     advice=ADVICE,
     examples=EXAMPLES,
     plausible={"battery.voltage": (3.0, 100.0), "battery.current": (-200.0, 200.0)},

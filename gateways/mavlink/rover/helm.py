@@ -279,7 +279,7 @@ class Helm(Kept):
             self._why, self._listens = reason, True
         if action is HelmAction.ASK:
             stopping = before is HelmState.STOPPING
-            self._explained = (*self._explained, RoverMode.HOLD) if stopping else (self.mode or 0,)
+            self._explained = tuple({*self._explained, int(RoverMode.HOLD)}) if stopping else (self.mode or 0,)
             self._said = ""
             self._begin(now, in_flight=stopping)
         elif action is HelmAction.STOP:

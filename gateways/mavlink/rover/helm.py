@@ -24,6 +24,7 @@ from enum import Enum, StrEnum
 from typing import Any, ClassVar, TypeAlias
 
 from gateways.mavlink.numbers import RoverMode
+from gateways.mavlink.rover.advice import NOT_HELD
 from zbridge.protocol import Kept, NotReady
 
 ASK_S = 2.0
@@ -171,7 +172,7 @@ class Helm(Kept):
     def warning(self) -> str | None:
         """A stop that the rover did not confirm."""
         unconfirmed = self._unconfirmed
-        return f"HOLD was not confirmed: mode {name_of_mode(unconfirmed)}" if unconfirmed is not None else None
+        return f"{NOT_HELD}: mode {name_of_mode(unconfirmed)}" if unconfirmed is not None else None
 
     @property
     def due(self) -> float:

@@ -153,7 +153,7 @@ def failsafe_warnings(parameters: dict[str, float], options: RoverOptions) -> tu
     warnings += [*_too_long(parameters, "RC_OVERRIDE_TIME"), *_too_long(parameters, "FS_GCS_TIMEOUT")]
     station = parameters.get("MAV_GCS_SYSID", parameters.get("SYSID_MYGCS", options.system_id))
     if station != options.system_id:
-        warnings.append(f"{OTHER_STATION} {station:g}: it ignores the sticks of system {options.system_id}")
+        warnings.append(f"{OTHER_STATION} {station:g}: the rover ignores the sticks of system {options.system_id}")
     return tuple(warnings)
 
 
@@ -165,7 +165,7 @@ def _too_long(parameters: dict[str, float], name: str) -> list[str]:
     seconds = parameters.get(name, 0.0)
     if 0.0 <= seconds <= LONG_S:
         return []
-    return [f"{name} is {seconds:g}: it drives on so long if the gateway dies"]
+    return [f"{name} is {seconds:g} s: the rover drives on for so long if the gateway dies"]
 
 
 def command_long(command: int, number: float, more: float, vehicle: int, confirmation: int = 0) -> CommandLong:

@@ -1,7 +1,8 @@
 """The conversation with one ArduRover, as its ground station. Sans-IO.
 
 Source: "The gateway as HQ" of the protocol page. The rover is established when it was found, and lost when its
-HEARTBEAT did not come for 3 s; other messages are no sign of life. What others on the link send is counted.
+HEARTBEAT did not come for 3 s; other messages are no sign of life. It may hear us still, and motion may be on its way,
+so the last words are a stop. What others on the link send is counted.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ from gateways.mavlink.numbers import (
     Result,
     RoverMode,
 )
+from gateways.mavlink.rover.advice import NO_BEAT, NO_ROVER, ONLY_OTHERS, TWO_VEHICLES, WITH_PX4
 from gateways.mavlink.rover.helm import STOP_S, Helm, HelmAction, HelmState
 from gateways.mavlink.rover.options import RoverOptions
 from gateways.mavlink.rover.requests import (
@@ -149,9 +151,10 @@ class RoverSession(MavlinkSession[Any]):
 
     def overdue(self) -> str:
         wanted = f"system {self._wanted}" if self._wanted else "a rover or boat"
-        others = f"; {self.left_out[_OTHERS]} frames of others" if self.left_out[_OTHERS] else ""
         foreign = f"; {self._foreign}" if self._foreign else ""
-        return f"no HEARTBEAT of {wanted} within {HANDSHAKE_S:g} s{others}{foreign}"
+        if others := self.left_out[_OTHERS]:
+            return f"{ONLY_OTHERS} {others} frames of others within {HANDSHAKE_S:g} s: expected {wanted}{foreign}"
+        return f"{NO_BEAT} {HANDSHAKE_S:g} s: expected {wanted}{foreign}"
 
     def _find(self, system: int, beat: MavlinkHeartbeat, now: float) -> None:
         """Establish the session once it is sure which system is the rover."""
@@ -159,8 +162,8 @@ class RoverSession(MavlinkSession[Any]):
         if not system or (system != self._wanted if self._wanted else not is_rover):
             self.left_out[_OTHERS] += 1
         elif beat.autopilot != ARDUPILOT or not is_rover:
-            kind = f"is of type {beat.kind}, autopilot {beat.autopilot}: expected an ArduRover"
-            px4 = f"has a PX4 (autopilot {PX4}): only ArduPilot is supported"
+            kind = f"is of type {beat.kind}, autopilot {beat.autopilot}: {NO_ROVER}"
+            px4 = f"{WITH_PX4} (autopilot {PX4}): only ArduPilot is supported"
             self._foreign = f"vehicle {system} {px4 if beat.autopilot == PX4 else kind}"
             self.left_out[_OTHERS] += 1
             if self._wanted:
@@ -182,7 +185,7 @@ class RoverSession(MavlinkSession[Any]):
         self.version = f"{number >> 24}.{number >> 16 & 0xFF}.{number >> 8 & 0xFF}" if number else ""
         uid = (message.uid, message.uid2)
         if self._uid not in (None, uid):
-            self.busy = f"two vehicles have the id {self.vehicle}"
+            self.busy = f"{TWO_VEHICLES} {self.vehicle}"
         self._uid = uid
 
     def _answered(self, message: CommandAck, now: float) -> None:
@@ -194,11 +197,23 @@ class RoverSession(MavlinkSession[Any]):
     # Time
 
     def timers(self) -> float:
-        return min(self.requests.due, self.helm.due) if self.state is State.ESTABLISHED else math.inf
+        due = min(self.requests.due, self.helm.due, self.silence.due)
+        return due if self.state is State.ESTABLISHED else math.inf
 
     def on_timer(self, now: float) -> None:
+        if now >= self.silence.due and (lost := self.silence.judge(now, None)[1]):
+            self._leave(lost, now)
+            return
         self.requests.expire(now)
         self._do(self.helm.expire(now), now)
+
+    def _leave(self, reason: str, now: float) -> None:
+        """End with a stop, behind motion that the link may still hold: the rover may hear us."""
+        self.outbox.clear(_MODE)
+        self.outbox.clear(MOTION)
+        if self.helm.ours:
+            self.halt(now, now, ordered=False)
+        self.close(reason, now)
 
     def _warn(self) -> None:
         if not self.over:

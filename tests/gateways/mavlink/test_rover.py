@@ -399,6 +399,16 @@ def test_a_rover_that_is_disarmed_does_not_drive_on_when_it_is_armed_again() -> 
     assert (scene.simulated.mode, scene.simulated.speed_m_s) == (RoverMode.HOLD, 0.0)
 
 
+@pytest.mark.parametrize(("shown", "state"), [(4, HelmState.OTHERS), (3, HelmState.OTHERS), (15, HelmState.DRIVING)])
+def test_nothing_is_in_flight_on_a_new_connection(shown: int, state: HelmState) -> None:
+    helm = driven()
+    helm.stop(1.0, ordered=False)
+    helm.move(1.1)  # lost with the connection, or not
+    helm.found(1)
+    helm.show(shown, armed=True, now=1.5)
+    assert helm.state is state
+
+
 def test_our_own_hold_that_is_shown_late_is_no_reason_to_send_nothing() -> None:
     helm = driven()
     helm.stop(2.0, ordered=False)

@@ -116,7 +116,7 @@ class Trial:
         self.check()
 
 
-EVENTS = ("drive", "neutral", "rest", "stop", "late", "lose", "pilot", "arming", "connect")
+EVENTS = ("drive", "drive", "neutral", "rest", "stop", "late", "lose", "pilot", "arming", "connect")
 STEPS = st.lists(
     st.tuples(st.sampled_from(EVENTS), st.sampled_from([0.0, 0.1, 0.2, 0.3, 0.5])), min_size=1, max_size=12
 )

@@ -207,9 +207,9 @@ REASONS = {
         "vehicle 1 is of type 2, autopilot 3: expected an ArduRover": "no_rover",
         "two vehicles have the id 1": "two_vehicles",
         "nothing came for 3 s": "heartbeat_lost",
-        "MAV_GCS_SYSID is 254: it ignores the sticks of system 255": "other_station",
+        "MAV_GCS_SYSID is 254: the rover ignores the sticks of system 255": "other_station",
         "HOLD was not confirmed: mode MANUAL": "not_held",
-        "GUID_TIMEOUT is 3: it drives on so long if the gateway dies": None,
+        "GUID_TIMEOUT is 3 s: the rover drives on for so long if the gateway dies": None,
     },
 }
 

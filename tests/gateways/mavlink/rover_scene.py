@@ -39,6 +39,16 @@ class RefusingRover(ArduRover):
         return super()._command(message)
 
 
+class MuteRover(ArduRover):
+    """A rover whose HEARTBEAT is lost while it is mute; all else comes."""
+
+    mute = False
+
+    def _beat(self) -> None:
+        if not self.mute:
+            super()._beat()
+
+
 def begin(rover: ArduRover | None = None, **options: Any) -> Scene:
     """Return a scene whose session is established; the first motion arms the rover, unless told otherwise."""
     scene = Scene(PROTOCOL, rover or ArduRover(), {"arm": "drive"} | options)

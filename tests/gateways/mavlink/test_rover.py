@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from gateways.mavlink.frames import numbered, write_frame
+from gateways.mavlink.frames import numbered, read_frame, write_frame
 from gateways.mavlink.messages import MavlinkMessage
 from gateways.mavlink.messages.control import (
     AutopilotVersion,
@@ -20,7 +20,17 @@ from gateways.mavlink.rover.helm import Helm, HelmAction, HelmState
 from gateways.mavlink.rover.options import RoverOptions
 from gateways.mavlink.rover.session import RoverSession
 from gateways.mavlink.simulator import ArduRover
-from tests.gateways.mavlink.rover_scene import HOLD, DeafRover, RefusingRover, begin, drive, modes, plain, sent
+from tests.gateways.mavlink.rover_scene import (
+    HOLD,
+    DeafRover,
+    MuteRover,
+    RefusingRover,
+    begin,
+    drive,
+    modes,
+    plain,
+    sent,
+)
 from zbridge.errors import NeutralFirst, NotReady, Unsupported
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, Mode
@@ -106,7 +116,7 @@ def test_a_rover_that_is_no_ardurover_is_named_and_does_not_hide_the_one_beside_
     hears(session, beat, 9)
     assert session.state is State.HANDSHAKING
     session.expire(10.0)
-    assert session.reason == f"no HEARTBEAT of a rover or boat within 10 s; 1 frames of others; {what}"
+    assert session.reason == f"no HEARTBEAT but 1 frames of others within 10 s: expected a rover or boat; {what}"
     session = opened()
     for heard, system in ((beat, 9), (ROVER, 1), (beat, 9), (ROVER, 1)):
         hears(session, heard, system)
@@ -127,7 +137,7 @@ def test_a_process_drives_the_rover_that_it_found_first_and_no_other() -> None:
     scene.simulated.switch_arming(True)
     scene.connect()
     scene.run(10.1)
-    assert scene.session.reason.startswith("no HEARTBEAT of system 1 within 10 s")
+    assert scene.session.reason.endswith("expected system 1")
     assert scene.simulated.mode is RoverMode.GUIDED
 
 
@@ -164,7 +174,32 @@ def test_a_rover_without_heartbeat_is_lost_after_three_seconds_whatever_else_com
         session.expire(now)
     assert session.state is State.ESTABLISHED
     session.expire(3.2)
-    assert (session.state, session.reason) == (State.CLOSED, "nothing came for 3 s")
+    assert (session.state, session.reason) == (State.CLOSING, "nothing came for 3 s")
+
+
+def test_a_rover_that_is_lost_while_we_drive_it_is_sent_a_stop_behind_all_motion() -> None:
+    rover = MuteRover()
+    scene = begin(rover)
+    drive(scene, 1.0)
+    rover.mute = True
+    drive(scene, 2.0)
+    assert not scene.session.over
+    scene.run(1.2)
+    assert scene.session.state is State.CLOSED
+    setpoint, hold = plain(scene)[-2:]
+    assert (read_frame(setpoint).message.vx, hold) == (0.0, HOLD)  # type: ignore[union-attr]
+    assert rover.mode is RoverMode.HOLD
+
+
+def test_a_rover_that_is_lost_in_the_mode_of_its_pilot_is_left_alone() -> None:
+    rover = MuteRover()
+    scene = begin(rover)
+    rover.switch_mode(RoverMode.AUTO)
+    scene.run(0.1)
+    rover.mute, before = True, len(scene.written)
+    scene.run(3.5)
+    assert scene.session.over
+    assert modes(scene, before) == []
 
 
 def test_two_vehicles_with_one_id_are_not_driven() -> None:
@@ -644,15 +679,15 @@ def test_rates_are_bounded(rate: float) -> None:
 @pytest.mark.parametrize(
     ("parameters", "options", "warnings"),
     [
-        ({}, {}, ("GUID_TIMEOUT is 3: it drives on so long if the gateway dies",)),
+        ({}, {}, ("GUID_TIMEOUT is 3 s: the rover drives on for so long if the gateway dies",)),
         ({"GUID_TIMEOUT": 1.0}, {}, ()),
         (
             {"MAV_GCS_SYSID": 250.0, "FS_GCS_TIMEOUT": 2.0},
             {"drive": "manual"},
             (
                 "FS_GCS_ENABLE is 0: no failsafe acts if the gateway dies",
-                "RC_OVERRIDE_TIME is 3: it drives on so long if the gateway dies",
-                "MAV_GCS_SYSID is 250: it ignores the sticks of system 255",
+                "RC_OVERRIDE_TIME is 3 s: the rover drives on for so long if the gateway dies",
+                "MAV_GCS_SYSID is 250: the rover ignores the sticks of system 255",
             ),
         ),
         ({"FS_GCS_ENABLE": 1.0, "FS_GCS_TIMEOUT": 2.0, "RC_OVERRIDE_TIME": 1.0}, {"drive": "manual"}, ()),
@@ -669,7 +704,7 @@ def test_another_process_takes_a_driving_rover_over_and_can_stop_it() -> None:
     scene = begin()
     drive(scene, 0.5)
     scene.restart()
-    assert scene.session.warnings == ("GUID_TIMEOUT is 3: it drives on so long if the gateway dies",)
+    assert scene.session.warnings == ("GUID_TIMEOUT is 3 s: the rover drives on for so long if the gateway dies",)
     since = len(scene.written)
     drive(scene, 5.0, 0.1)
     assert (modes(scene, since), scene.robot.helm.state) == ([], HelmState.DRIVING)

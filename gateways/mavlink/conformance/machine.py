@@ -303,7 +303,8 @@ class StationRules:
     def _move(self, what: str, moves: bool) -> None:
         """Judge a setpoint or a stick."""
         self._judge_pilot(what, stops=not moves)
-        self._zeroed, self._motion_s = not moves, self._awake_s if moves else None
+        watched = moves and self._piloted_s is None  # else it was on its way when somebody took the vehicle
+        self._zeroed, self._motion_s = not moves, self._awake_s if watched else None
         if not moves:
             return
         mode, armed = self._shown

@@ -31,6 +31,8 @@ _PARAMETERS = {
 }
 _MOST_SENDS, _QUICKEST_S = 4, 0.9
 """Of a command without ACK: how often it is sent, and the least time for that many (0.5 s apart: 1.5 s)."""
+_UNKNOWN_BEATS = 2
+"""HEARTBEATs of a vehicle that was never found before, until it is spoken to."""
 _GIVEN_BACK = 32767
 _ASKED_S = 2.0
 """How long after a request for the mode to drive in a setpoint may come before HEARTBEAT shows it."""
@@ -93,6 +95,7 @@ class StationRules:
             "PARAM_REQUEST_READ": self._judge_parameter,
         }
         self._shown, self._shown_s = (-1, False), 0.0
+        self._found = False
         self.connected()
 
     @property
@@ -100,7 +103,8 @@ class StationRules:
         return self._expected.vehicle_id
 
     def connected(self) -> None:
-        """Begin with another connection; modes and what was ordered outlast it."""
+        """Begin with another connection; modes and what was ordered outlast it, and so does which vehicle it is."""
+        self._wanted_beats = 1 if self._found else _UNKNOWN_BEATS
         self._vehicle_beats, self._vehicle_beat_s = 0, -math.inf
         self._beats, self._first_beat, self._beat_s = 0, 0.0, -math.inf
         self._requests: dict[tuple[int, int], _Request] = {}
@@ -110,7 +114,8 @@ class StationRules:
     def heartbeat_sent(self, mode: int, armed: bool) -> None:
         """Note what the vehicle's HEARTBEAT shows, before it is sent."""
         self._vehicle_beats, self._vehicle_beat_s = self._vehicle_beats + 1, self._awake_s
-        if self._vehicle_beats == 2:
+        self._found = self._found or self._vehicle_beats >= self._wanted_beats
+        if self._vehicle_beats == self._wanted_beats:
             self._beat_s = self._awake_s
         if (mode, armed) != self._shown:
             self._shown, self._shown_s = (mode, armed), self._awake_s
@@ -133,7 +138,7 @@ class StationRules:
         """Judge what is overdue. ``now``: monotonic seconds; ``passed_s``: how long the judge listened."""
         self._now, self._awake_s = now, self._awake_s + passed_s
         expected, awake_s = self._expected, self._awake_s
-        alive = self._vehicle_beats >= 2 and awake_s - self._vehicle_beat_s < 2.0
+        alive = self._vehicle_beats >= self._wanted_beats and awake_s - self._vehicle_beat_s < 2.0
         if alive and awake_s - self._beat_s > expected.heartbeat_s:
             self._violate(f"no HEARTBEAT for {awake_s - self._beat_s:.2f} s")
             self._beat_s = math.inf
@@ -160,8 +165,8 @@ class StationRules:
         system, component = target(frame.fields)
         if system not in (None, expected.vehicle_id) or component not in (None, 1):
             self._violate(f"{frame.name} to {system}/{component}")
-        if self._vehicle_beats < 2 and not self._ordered():
-            self._violate(f"{frame.name} before two HEARTBEATs of the vehicle")
+        if self._vehicle_beats < self._wanted_beats and not self._ordered():
+            self._violate(f"{frame.name} before {self._wanted_beats} HEARTBEATs of the vehicle")
         if handler := self._handlers.get(frame.name):
             handler(frame.fields)
         else:

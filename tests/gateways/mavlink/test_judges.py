@@ -339,7 +339,7 @@ def test_nothing_is_sent_before_two_heartbeats_and_only_from_the_configured_ids(
     ground = Ground()
     ground.wait(0.5)
     ground.command(512, 148)
-    assert ground.violations == ["COMMAND_LONG before two HEARTBEATs of the vehicle"]
+    assert ground.violations == ["COMMAND_LONG before 2 HEARTBEATs of the vehicle"]
     ground.wait(2.0)
     ground.source = (254, 190)
     ground.command(512, 148)

@@ -151,10 +151,11 @@ class RoverSession(MavlinkSession[Any]):
 
     def overdue(self) -> str:
         wanted = f"system {self._wanted}" if self._wanted else "a rover or boat"
-        foreign = f"; {self._foreign}" if self._foreign else ""
+        if self._foreign:
+            return self._foreign
         if others := self.left_out[_OTHERS]:
-            return f"{ONLY_OTHERS} {others} frames of others within {HANDSHAKE_S:g} s: expected {wanted}{foreign}"
-        return f"{NO_BEAT} {HANDSHAKE_S:g} s: expected {wanted}{foreign}"
+            return f"{ONLY_OTHERS} {others} frames of others within {HANDSHAKE_S:g} s: expected {wanted}"
+        return f"{NO_BEAT} {HANDSHAKE_S:g} s: expected {wanted}"
 
     def _find(self, system: int, beat: MavlinkHeartbeat, now: float) -> None:
         """Establish the session once it is sure which system is the rover."""
@@ -189,6 +190,8 @@ class RoverSession(MavlinkSession[Any]):
         self._uid = uid
 
     def _answered(self, message: CommandAck, now: float) -> None:
+        if message.result == Result.IN_PROGRESS:
+            return
         self.requests.answered(message.command, now)
         if message.command in (Command.DO_SET_MODE, Command.ARM):
             what = "arming" if message.command == Command.ARM else f"mode {self.helm.driving.name}"

@@ -209,8 +209,8 @@ MUTANTS = (
         "stop never written",
         None,
         ENFORCER,
-        "                if event.stops:\n                    self._send_stop()",
-        "                if False:\n                    self._send_stop()",
+        "                if event.stops:\n                    self._send_stop(",
+        "                if False:\n                    self._send_stop(",
     ),
     Mutant(
         "autonomous mode survives a stall",
@@ -252,7 +252,7 @@ MUTANTS = (
         "a reconnected robot is not stopped",
         "situations",
         PRESENCE,
-        "            self._standstill.stop()\n        self._enforcer.lease_hook",
+        "            self._standstill.stop(ordered=False)\n        self._enforcer.lease_hook",
         "            pass\n        self._enforcer.lease_hook",
     ),
     # ownership

@@ -28,7 +28,7 @@ from gateways.mavlink.rover.advice import NOT_HELD
 from zbridge.protocol import Kept, NotReady
 
 ASK_S = 2.0
-"""Seconds within which the rover must show the mode that it was asked for: four requests."""
+"""Seconds within which the rover must do what it was asked for (four requests), and then show it."""
 STOP_S = 1.0
 """Seconds for which HOLD is asked for."""
 FLIGHT_S = 1.0
@@ -189,6 +189,10 @@ class Helm(Kept):
             raise NotReady("disarmed")
         return self._handle(HelmInput.MOTION, now)
 
+    def wait(self, now: float) -> None:
+        """Note that the rover has done what it was asked for: it has time again to show it, and for what comes next."""
+        self._since = now
+
     def neutral(self, now: float) -> HelmAction:
         """Note a neutral: motion is allowed again. A driver who lets go before the rover was ours wants it no more."""
         self._why = ""
@@ -244,7 +248,7 @@ class Helm(Kept):
     def _meaning(self, now: float, *, late: bool) -> HelmInput | None:
         """Return what the mode that was just shown means. late: a stop should be over."""
         mode, state = self.mode, self.state
-        ours, counts, recent = mode == self.driving, now >= self._counts_from, now < self._ours_until
+        ours, counts, recent = mode == self.driving, self.counts(now), now < self._ours_until
         meaning: HelmInput | None = None
         if state is HelmState.ASKED:
             if ours and self.armed and counts:
@@ -266,6 +270,10 @@ class Helm(Kept):
         elif mode != RoverMode.HOLD:
             meaning = HelmInput.TAKEN
         return meaning
+
+    def counts(self, now: float) -> bool:
+        """Return whether what is heard now is behind our newest request."""
+        return now >= self._counts_from
 
     # The machine
 

@@ -39,7 +39,7 @@ from gateways.mavlink.numbers import (
     RoverMode,
 )
 from gateways.mavlink.rover.advice import NO_BEAT, NO_ROVER, ONLY_OTHERS, TWO_VEHICLES, WITH_PX4
-from gateways.mavlink.rover.helm import STOP_S, Helm, HelmAction, HelmState
+from gateways.mavlink.rover.helm import ASK_S, STOP_S, Helm, HelmAction, HelmState
 from gateways.mavlink.rover.options import RoverOptions
 from gateways.mavlink.rover.requests import (
     AGAIN_S,
@@ -85,6 +85,7 @@ class RoverSession(MavlinkSession[Any]):
         "_foreign": str,
         "_uid": tuple[int, bytes] | None,
         "_motion": bytes,
+        "_asks": int,
     }
 
     def __init__(self, options: RoverOptions, helm: Helm) -> None:
@@ -100,6 +101,8 @@ class RoverSession(MavlinkSession[Any]):
         self._uid: tuple[int, bytes] | None = None
         self._motion = b""
         """The motion that is wanted; a stick is sent once the rover shows our mode."""
+        self._asks = 0
+        """The command that is repeated until our mode is shown."""
         self._now = -math.inf
         self._lives = False
         """Whether the rover's HEARTBEAT is among what was just read."""
@@ -180,6 +183,8 @@ class RoverSession(MavlinkSession[Any]):
 
     def _show(self, beat: MavlinkHeartbeat, now: float) -> None:
         self._do(self.helm.show(beat.custom_mode, armed=bool(beat.base_mode & ARMED), now=now), now)
+        if beat.custom_mode == self.helm.driving:
+            self._go_on(Command.DO_SET_MODE, now)
 
     def _identify(self, message: AutopilotVersion) -> None:
         number = message.flight_sw_version
@@ -195,7 +200,10 @@ class RoverSession(MavlinkSession[Any]):
         self.requests.answered(message.command, now)
         if message.command in (Command.DO_SET_MODE, Command.ARM):
             what = "arming" if message.command == Command.ARM else f"mode {self.helm.driving.name}"
-            self._do(self.helm.answer(what, now, accepted=message.result == Result.ACCEPTED), now)
+            accepted = message.result == Result.ACCEPTED
+            self._do(self.helm.answer(what, now, accepted=accepted), now)
+            if accepted:
+                self._go_on(message.command, now)
 
     # Time
 
@@ -268,13 +276,28 @@ class RoverSession(MavlinkSession[Any]):
         self._warn()
 
     def _ask(self, now: float) -> None:
-        """Ask for our mode, and to arm where the driver does."""
-        asks = [self._mode(self.helm.driving)]
-        if self.helm.arms and not self.helm.armed:
-            asks.append(command_long(Command.ARM, 1.0, 0.0, self.vehicle))
-        until = now + AGAIN_S * (TRIES - 0.5)
+        """Ask for our mode."""
         self.outbox.clear(MOTION)  # a stop that is repeated
-        self.outbox.set(_MODE, tuple(map(self.encode, asks)), -math.inf, period_s=AGAIN_S, until=until)  # goes first
+        self._repeat(self._mode(self.helm.driving), -math.inf)  # goes first
+
+    def _go_on(self, done: int, now: float) -> None:
+        """Ask no more for what the rover has done: it may be undone by its pilot. Behind our mode, ask to arm.
+
+        Never before: in the mode of a mission, arming begins it.
+        """
+        if self.helm.state is not HelmState.ASKED or done != self._asks or not self.helm.counts(now):
+            return
+        self.outbox.clear(_MODE)
+        self._asks = 0
+        self.helm.wait(now)
+        if done == Command.DO_SET_MODE and self.helm.arms and not self.helm.armed:
+            self._repeat(command_long(Command.ARM, 1.0, 0.0, self.vehicle), now)
+
+    def _repeat(self, command: CommandLong, now: float) -> None:
+        """Repeat a request while the helm waits for it."""
+        self._asks = command.command
+        until = self.helm.due - ASK_S + AGAIN_S * (TRIES - 0.5)
+        self.outbox.set(_MODE, (self.encode(command),), now, period_s=AGAIN_S, until=until)
 
     def _move(self, now: float) -> None:
         """Send the newest motion, and repeat it.

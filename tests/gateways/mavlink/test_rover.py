@@ -323,6 +323,45 @@ def test_a_mode_that_is_never_shown_is_asked_for_four_times_and_then_not_ready()
     assert modes(scene) == [RoverMode.GUIDED] * 4
 
 
+def test_nothing_is_armed_in_the_mode_of_a_mission() -> None:
+    scene = begin(rover := DeafRover())
+    rover.deaf = {Command.DO_SET_MODE: 2}
+    rover.switch_mode(RoverMode.AUTO)  # a mission begins when the rover is armed
+    scene.run(0.1)
+    scene.drive(0.5)
+    scene.run(0.9)
+    assert (rover.mode, rover.armed, rover.speed_m_s) == (RoverMode.AUTO, False, 0.0)
+    scene.run(0.5)
+    assert (rover.mode, rover.armed, scene.robot.helm.state) == (RoverMode.GUIDED, True, HelmState.DRIVING)
+
+
+def test_what_the_rover_accepted_is_asked_for_no_more() -> None:
+    scene = begin(rover := MuteRover())
+    rover.switch_arming(True)
+    rover.switch_mode(RoverMode.STEERING)
+    scene.run(0.1)
+    rover.mute = True  # it may show a new mode a second later
+    scene.drive(0.5)
+    scene.run(0.1)
+    assert rover.mode is RoverMode.GUIDED
+    rover.switch_mode(RoverMode.STEERING)
+    scene.run(1.0)
+    assert (rover.mode, modes(scene)) == (RoverMode.STEERING, [RoverMode.GUIDED])
+    rover.mute = False
+    scene.run(3.0)
+    assert (rover.mode, scene.robot.helm.state) == (RoverMode.STEERING, HelmState.OTHERS)
+
+
+def test_a_rover_that_accepted_our_mode_has_time_to_show_it() -> None:
+    helm = Helm(RoverMode.GUIDED, arms=False)
+    helm.show(4, armed=True, now=0.0)
+    helm.move(0.0)
+    helm.wait(1.0)  # the answer of a slow link
+    assert helm.expire(2.5) is HelmAction.NOTHING
+    helm.show(15, armed=True, now=2.6)
+    assert helm.state is HelmState.DRIVING
+
+
 # Stops
 
 

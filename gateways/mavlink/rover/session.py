@@ -59,7 +59,7 @@ REPEAT_S = {"guided": 0.2, "manual": 0.1}
 """Seconds after which motion is repeated."""
 STOP_AGAIN_S = 0.2
 ABANDON_S = 0.5
-"""Seconds for which zero setpoints follow a request for our mode that may still arrive."""
+"""Seconds for which zero setpoints follow a request for our mode that may still arrive; also of giving sticks back."""
 FULL_STICK = 1000
 GIVE_BACK = 32767
 """The value of an axis that gives it back to the RC receiver: else the last stick would count for 3 s more."""
@@ -272,7 +272,10 @@ class RoverSession(MavlinkSession[Any]):
                     self.outbox.set(MOTION, zero, now, period_s=STOP_AGAIN_S, until=now + ABANDON_S)
                 if self.helm.overrides and not self.over:
                     self.helm.overrides = False
-                    self.send_first(ManualControl(y=GIVE_BACK, z=GIVE_BACK, target=self.vehicle))
+                    back = (self.encode(ManualControl(y=GIVE_BACK, z=GIVE_BACK, target=self.vehicle)),)
+                    # Repeated: without it, our last stick would move a pilot's rover for 3 s.
+                    until = now + ABANDON_S
+                    self.outbox.set(MOTION, back, now, period_s=STOP_AGAIN_S, until=until, urgent=True)
         self._warn()
 
     def _ask(self, now: float) -> None:

@@ -36,7 +36,8 @@ _NEUTRAL = Drive()
 
 
 def manual_control(station: Station, message: ManualControl, sender: MavlinkFrame) -> tuple[Telemetry, ...]:
-    """Take a stick: z ahead, y to the right, thousandths."""
+    """Take a stick: z ahead, y to the right, thousandths. It takes the place of an RC override."""
+    station.stick.channels_us = [CENTRE_US, CENTRE_US]
     return _move_stick(station, *(0 if axis == _GIVEN_BACK else axis for axis in (message.z, message.y)))
 
 
@@ -69,8 +70,10 @@ def setpoint(station: Station, message: SetPositionTargetLocalNed, sender: Mavli
 
 
 def enter(station: Station, mode: RoverMode) -> tuple[Telemetry, ...]:
-    """Take a new mode: motion of the one before ends, and GUIDED begins with a neutral."""
+    """Take a new mode: motion of the one before ends, and GUIDED begins with a neutral, which is none of the stick."""
     stick = station.stick
+    stick.channels_us = [CENTRE_US, CENTRE_US]
+    stick.owes = stick.owes or mode is RoverMode.GUIDED
     moving, stick.last, stick.changed_at = stick.last.moving, _NEUTRAL, station.now
     stick.entered, stick.target_at, stick.live_from = mode is RoverMode.GUIDED, -math.inf, math.inf
     return _drive(station, _NEUTRAL) if moving or stick.entered else ()
@@ -97,10 +100,17 @@ def _live(station: Station) -> bool:
 
 
 def _move_stick(station: Station, throttle: int, steering: int) -> tuple[Telemetry, ...]:
-    station.stick.axes, station.stick.heard_at = (throttle, steering), station.now
-    if not (station.armed and station.mode == RoverMode.MANUAL):
+    stick, counts = station.stick, station.mode == RoverMode.MANUAL
+    stick.axes, stick.heard_at = (throttle, steering), station.now
+    forward, right = (_zeroed(station, axis) / _FULL for axis in stick.axes)
+    deflected = bool(forward or right)
+    stick.owes = deflected and (stick.owes or not counts)
+    if not (station.armed and counts):
         return ()
-    forward, right = (_zeroed(station, axis) / _FULL for axis in (throttle, steering))
+    if stick.owes:
+        station.rest(station.now)
+        station.warn(RELEASE)
+        return ()
     return _drive(station, Drive(forward=_clip(forward), turn=_clip(-right)))
 
 

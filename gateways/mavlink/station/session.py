@@ -51,6 +51,8 @@ class SaidMotion(msgspec.Struct):
     heard_at: float = -math.inf
     channels_us: list[int] = msgspec.field(default_factory=lambda: [CENTRE_US, CENTRE_US])
     """Throttle and steering of the RC override."""
+    owes: bool = False
+    """Whether the stick must be released first: it was away from zero, or not heard, when MANUAL was entered."""
     entered: bool = False
     """Whether GUIDED was entered, and no motion has counted since."""
     target_at: float = -math.inf

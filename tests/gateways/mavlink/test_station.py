@@ -388,6 +388,24 @@ def test_a_stick_that_rests_at_half_throttle_moves_nothing() -> None:
     assert not ground.shown[1]
 
 
+@pytest.mark.parametrize("rests_at", [0, 500])
+def test_entering_guided_is_no_neutral_of_the_stick(rests_at: int) -> None:
+    _, ground = guided()
+    ground.stick(0)
+    ground.stick(rests_at)
+    assert drives(ground.mode(MANUAL)) == []
+    assert drives(ground.stick(500)) == ([] if rests_at else [Drive(forward=0.5)])
+    if rests_at:
+        assert (ground.shown, ground.texts[-1]) == ((HOLD, False), "release the stick (QGC: centre is zero throttle)")
+
+
+def test_a_stick_that_was_not_heard_before_must_be_released() -> None:
+    _, ground = guided()
+    ground.mode(MANUAL)
+    assert not ground.stick(500)
+    assert ground.shown == (HOLD, False)
+
+
 def test_changing_the_mode_ends_the_motion_of_the_one_before() -> None:
     _, ground = guided()
     assert drives(ground.aims(1.0))[0].moving
@@ -544,6 +562,21 @@ def test_an_override_of_long_ago_is_no_throttle() -> None:
     scene.runs(3.5)
     ground.mode(MANUAL)
     ground.commands(ARM, 1)
+    centre = mavlink.MAVLink_rc_channels_override_message(SYSTEM, 1, 1500, 65535, 65535, 0, 0, 0, 0, 0)
+    steering = mavlink.MAVLink_rc_channels_override_message(SYSTEM, 1, 1600, 65535, 65535, 0, 0, 0, 0, 0)
+    assert drives(ground.says(centre, steering)) == [Drive(), Drive(turn=-0.2)]
+
+
+@pytest.mark.parametrize("through", ["stick", "mode"])
+def test_an_override_does_not_outlast_what_came_in_its_place(through: str) -> None:
+    (ground,) = Scene().stations
+    ground.mode(MANUAL)
+    ground.commands(ARM, 1)
+    ground.says(mavlink.MAVLink_rc_channels_override_message(SYSTEM, 1, 1500, 65535, 1800, 0, 0, 0, 0, 0))
+    if through == "stick":
+        ground.stick(0)
+    else:
+        ground.mode(MANUAL)
     steering = mavlink.MAVLink_rc_channels_override_message(SYSTEM, 1, 1600, 65535, 65535, 0, 0, 0, 0, 0)
     assert drives(ground.says(steering)) == [Drive(turn=-0.2)]
 

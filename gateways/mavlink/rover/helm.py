@@ -191,7 +191,7 @@ class Helm(Kept):
 
     def wait(self, now: float) -> None:
         """Note that the rover has done what it was asked for: it has time again to show it, and for what comes next."""
-        self._since = now
+        self._since, self._ours_until = now, now + OURS_S[self.driving]
 
     def neutral(self, now: float) -> HelmAction:
         """Note a neutral: motion is allowed again. A driver who lets go before the rover was ours wants it no more."""

@@ -362,6 +362,15 @@ def test_a_rover_that_accepted_our_mode_has_time_to_show_it() -> None:
     assert helm.state is HelmState.DRIVING
 
 
+def test_a_mode_that_was_accepted_late_is_still_ours_when_it_is_shown() -> None:
+    helm = Helm(RoverMode.MANUAL, arms=False)
+    helm.show(4, armed=True, now=0.0)
+    helm.move(0.0)
+    helm.wait(1.8)
+    helm.show(3, armed=True, now=2.0)  # as it seems, its pilot has it
+    assert helm.show(0, armed=True, now=2.5) is HelmAction.STOP
+
+
 # Stops
 
 

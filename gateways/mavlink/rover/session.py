@@ -245,7 +245,7 @@ class RoverSession(MavlinkSession[Any]):
 
     def stop_frames(self) -> tuple[bytes, ...]:
         """Return neutral, then HOLD; HOLD alone where no stick of ours is to be made neutral."""
-        hold = self.encode(self._mode(RoverMode.HOLD))
+        hold = self.encode(_set_mode(RoverMode.HOLD, self.vehicle))
         return (hold,) if self._sticks and not self.helm.overrides else (self._steer(0.0, 0.0), hold)
 
     @property
@@ -258,7 +258,8 @@ class RoverSession(MavlinkSession[Any]):
             self.outbox.clear(_MODE)
         match action:
             case HelmAction.ASK:
-                self._ask(now)
+                self.outbox.clear(MOTION)  # a stop that is repeated
+                self._repeat(_set_mode(self.helm.driving, self.vehicle), -math.inf)  # goes first
                 self._move(now)
             case HelmAction.SEND:
                 self._move(now)
@@ -277,11 +278,6 @@ class RoverSession(MavlinkSession[Any]):
                     until = now + ABANDON_S
                     self.outbox.set(MOTION, back, now, period_s=STOP_AGAIN_S, until=until, urgent=True)
         self._warn()
-
-    def _ask(self, now: float) -> None:
-        """Ask for our mode."""
-        self.outbox.clear(MOTION)  # a stop that is repeated
-        self._repeat(self._mode(self.helm.driving), -math.inf)  # goes first
 
     def _go_on(self, done: int, now: float) -> None:
         """Ask no more for what the rover has done: it may be undone by its pilot. Behind our mode, ask to arm.
@@ -328,5 +324,6 @@ class RoverSession(MavlinkSession[Any]):
         )
         return self.encode(setpoint)
 
-    def _mode(self, mode: RoverMode) -> CommandLong:
-        return command_long(Command.DO_SET_MODE, float(CUSTOM_MODE), float(mode), self.vehicle)
+
+def _set_mode(mode: RoverMode, vehicle: int) -> CommandLong:
+    return command_long(Command.DO_SET_MODE, float(CUSTOM_MODE), float(mode), vehicle)

@@ -62,9 +62,14 @@ def hindrance(station: Station, view: RobotView) -> str | None:
         return None
     if control.latches:
         return f"stop {control.latches[-1].described}"
-    if station.awaits and station.now - station.stop_asked_at < STOPPING_S:
+    if is_stopping(station, station.now):
         return "stopping"
     return f"held by {control.holder}" if is_held(control, station.who) else None
+
+
+def is_stopping(station: Station, now: float) -> bool:
+    """Return whether news of the station's own stop is still to come; some may be lost."""
+    return bool(station.awaits) and now - station.stop_asked_at < STOPPING_S
 
 
 def is_held(control: Control, who: str) -> bool:

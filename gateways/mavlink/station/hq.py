@@ -98,7 +98,7 @@ class MavlinkHq(HqSide):
         return lambda session, now: session.appear(now, there=there)
 
     def tell(self, session: Station, text: str, now: float) -> None:
-        if session.awaits:  # its own stop, of which it knows
+        if commands.is_stopping(session, now):  # its own stop, of which it knows
             return
         for prefix in ("not driving: ", "drive: "):
             text = text.removeprefix(prefix)

@@ -503,6 +503,16 @@ def test_nobody_arms_until_the_stop_that_they_asked_for_is_shown() -> None:
     assert ground.shown == (HOLD, True)
 
 
+def test_a_stop_of_which_no_news_comes_hides_no_later_text() -> None:
+    scene, ground = guided()
+    ground.mode(HOLD)
+    scene.side.tell(ground.session, "not driving: stopped", scene.now)
+    assert ground.texts == []
+    scene.runs(1.1)
+    scene.side.tell(ground.session, "offline", scene.now)
+    assert ground.texts == ["offline"]
+
+
 def test_refused_motion_is_shown_by_the_armed_bit_at_once() -> None:
     scene, ground = guided()
     assert ground.shown == (GUIDED, True)

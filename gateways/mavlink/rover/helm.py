@@ -288,7 +288,9 @@ class Helm(Kept):
             self._why, self._listens = reason, True
         if action is HelmAction.ASK:
             stopping = before is HelmState.STOPPING
-            self._explained = tuple({*self._explained, int(RoverMode.HOLD)}) if stopping else (self.mode or 0,)
+            shown = self._explained if stopping else (self.mode or 0,)
+            held = (int(RoverMode.HOLD),) if stopping or now < self._ours_until else ()  # our HOLD may be shown late
+            self._explained = tuple({*shown, *held})
             self._said = ""
             self._begin(now, in_flight=stopping)
         elif action is HelmAction.STOP:

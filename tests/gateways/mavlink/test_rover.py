@@ -362,6 +362,19 @@ def test_a_rover_that_accepted_our_mode_has_time_to_show_it() -> None:
     assert helm.state is HelmState.DRIVING
 
 
+def test_our_own_hold_that_is_shown_late_refuses_no_motion() -> None:
+    helm = Helm(RoverMode.MANUAL, arms=False)
+    helm.show(3, armed=True, now=0.0)
+    helm.move(0.0)
+    assert helm.neutral(0.1) is HelmAction.STOP
+    helm.show(3, armed=True, now=0.5)  # it was sent before
+    assert helm.state is HelmState.OTHERS
+    helm.move(1.4)
+    assert helm.show(4, armed=True, now=1.5) is HelmAction.NOTHING
+    helm.show(0, armed=True, now=2.5)
+    assert helm.state is HelmState.DRIVING
+
+
 def test_a_mode_that_was_accepted_late_is_still_ours_when_it_is_shown() -> None:
     helm = Helm(RoverMode.MANUAL, arms=False)
     helm.show(4, armed=True, now=0.0)

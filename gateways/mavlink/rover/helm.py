@@ -169,6 +169,14 @@ class Helm(Kept):
         return name_of_mode(self.mode)
 
     @property
+    def hindrance(self) -> str | None:
+        """Why motion is refused now; None: it is not."""
+        if self._why:
+            return f"{self._why}: {self._said}" if self._said else self._why
+        drivable = self.armed or self.arms or self.state in (HelmState.ASKED, HelmState.DRIVING)
+        return None if drivable else "disarmed"
+
+    @property
     def warning(self) -> str | None:
         """A stop that the rover did not confirm."""
         unconfirmed = self._unconfirmed
@@ -183,10 +191,8 @@ class Helm(Kept):
 
     def move(self, now: float) -> HelmAction:
         """Allow motion; raise NotReady."""
-        if self._why:
-            raise NotReady(f"{self._why}: {self._said}" if self._said else self._why)
-        if not (self.armed or self.arms or self.state in (HelmState.ASKED, HelmState.DRIVING)):
-            raise NotReady("disarmed")
+        if (why := self.hindrance) is not None:
+            raise NotReady(why)
         return self._handle(HelmInput.MOTION, now)
 
     def wait(self, now: float) -> None:

@@ -228,8 +228,8 @@ class RoverSession(MavlinkSession[Any]):
 
     def _warn(self) -> None:
         if not self.over:
-            stops = (self.helm.warning,) if self.helm.warning else ()
-            self.warnings = (*failsafe_warnings(self.requests.parameters, self.options), *stops)
+            now = filter(None, (self.helm.hindrance, self.helm.warning))
+            self.warnings = (*now, *failsafe_warnings(self.requests.parameters, self.options))
 
     # Commands
 

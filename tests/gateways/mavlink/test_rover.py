@@ -786,3 +786,18 @@ def test_another_process_takes_a_driving_rover_over_and_can_stop_it() -> None:
     scene.rest()
     scene.run(0.5)
     assert scene.simulated.mode is RoverMode.HOLD
+
+
+def test_status_says_why_a_drive_would_be_refused() -> None:
+    scene = begin(rover := ArduRover(GUID_TIMEOUT=1.0), arm="operator")
+    assert scene.session.warnings == ("disarmed",)
+    rover.switch_arming(True)
+    scene.run(0.1)
+    assert scene.session.warnings == ()
+    drive(scene, 1.0)
+    rover.switch_mode(RoverMode.AUTO)
+    scene.run(0.1)
+    assert scene.session.warnings == ("mode AUTO",)
+    scene.drive()
+    scene.run(1.1)
+    assert scene.session.warnings == ()

@@ -148,7 +148,7 @@ async def test_a_flood_of_sources_leaves_no_more_than_the_bounds(
 
 
 async def test_an_address_to_is_a_client_unasked_lasts_in_silence_and_is_made_again(
-    served: Served, monkeypatch: pytest.MonkeyPatch
+    served: Served, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(sources, "SILENT_S", 0.05)
     monkeypatch.setattr(sources, "TO_S", 0.02)
@@ -168,6 +168,7 @@ async def test_an_address_to_is_a_client_unasked_lasts_in_silence_and_is_made_ag
         assert (data, len(served.came)) == (b"heartbeat", 1)
         first.link.abort()
         await until(lambda: len(served.came) == 2)
+    assert [record.message.endswith("tried again") for record in caplog.records] == [True], "once"
 
 
 async def test_the_socket_goes_to_another_process_with_all_clients(served: Served) -> None:

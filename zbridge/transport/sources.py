@@ -14,6 +14,7 @@ import socket
 from collections.abc import Callable
 
 from zbridge.errors import ProtocolError
+from zbridge.log import Log
 from zbridge.metrics import Count
 from zbridge.protocol.address import Address, DatagramAddress
 from zbridge.protocol.kept import Exported
@@ -23,6 +24,8 @@ from zbridge.transport.kernel import KERNEL, Kernel
 from zbridge.transport.link import Link, Receiver
 from zbridge.transport.transferable import Parcel
 from zbridge.transport.udp import DatagramHub, DatagramReader
+
+log = Log("zbridge.link")
 
 Source = tuple[str, int]
 
@@ -207,18 +210,29 @@ class SourceDoor(Door):
             self._calls.cancel()
         super().close()
 
+    def _last(self, links: dict[Address, SourceLink], address: Address, source: Source) -> None:
+        """Make the link to an address, unless there is one that still leads there."""
+        before = links.get(address)
+        if before is not None:
+            before.speaks_first = before.source == source  # else it ends by its silence
+        if self._sources.admits and not (before and before.ready and before.speaks_first):
+            links[address] = link = self._sources.link(source, speaks_first=True)
+            link.speaks_first = True
+
     async def _call(self) -> None:
         """See that there is a link to each address ``to``, where it is now, and that it lasts."""
         links: dict[Address, SourceLink] = {}
+        unknown: set[Address] = set()
         while True:
             for address in self._to:
-                with contextlib.suppress(OSError, UnicodeError):  # it may be known later
+                try:
                     async with asyncio.timeout(CONNECT_S):
                         found = (await resolved(address, self._sources.bound.family))[:2]
-                    before = links.get(address)
-                    if before is not None:
-                        before.speaks_first = before.source == found  # else it ends by its silence
-                    if self._sources.admits and not (before and before.ready and before.speaks_first):
-                        links[address] = link = self._sources.link(found, speaks_first=True)
-                        link.speaks_first = True
+                except (OSError, UnicodeError) as error:  # it may be known later
+                    if address not in unknown:
+                        log.warning("to_unresolved", "{address}: {error}; tried again", address=address, error=error)
+                    unknown.add(address)
+                    continue
+                unknown.discard(address)
+                self._last(links, address, found)
             await asyncio.sleep(TO_S)

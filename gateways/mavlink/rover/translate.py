@@ -23,6 +23,8 @@ class RoverRobot(RobotSide):
     """One rover on one link."""
 
     hands_over = True
+    closing_harmless = True
+    """It obeys each ground station alone; a second one of ours would feed its failsafe."""
     link_names = ("vehicle",)
     driving: RoverSession | None = None
     kept: ClassVar[dict[str, Any]] = {"helm": Helm, "_telemetry": RoverTelemetry}

@@ -788,6 +788,10 @@ def test_another_process_takes_a_driving_rover_over_and_can_stop_it() -> None:
     assert scene.simulated.mode is RoverMode.HOLD
 
 
+def test_a_second_gateway_leaves_the_rover_as_its_heartbeat_would_hide_a_lost_one() -> None:
+    assert begin().robot.closing_harmless
+
+
 def test_status_says_why_a_drive_would_be_refused() -> None:
     scene = begin(rover := ArduRover(GUID_TIMEOUT=1.0), arm="operator")
     assert scene.session.warnings == ("disarmed",)

@@ -160,8 +160,9 @@ def test_mavsdk_and_programs_of_other_protocols_take_turns(tmp_path: Path, stack
     program = scene.mavsdk()
     program.connected()
     fleet = scene.bench.fleet
-    fleet.hold("r1", "desk", lease_s=2.0)
+    fleet.hold("r1", "desk", lease_s=10.0)
     until(lambda: scene.control["holder"] == "desk", what="the holder is shown")
+    time.sleep(0.1)  # to the listener, too
     since = len(program.said)
     assert program.ask("arm")["result"] == "COMMAND_DENIED"
     _told(program, since, "desk")
@@ -171,6 +172,7 @@ def test_mavsdk_and_programs_of_other_protocols_take_turns(tmp_path: Path, stack
     assert stick.line() == "ready"
     stick.say("push")
     until(lambda: not scene.robot.still(), what="the old program drives")
+    time.sleep(0.1)
     since = len(program.said)
     assert program.ask("arm")["result"] == "COMMAND_DENIED"
     _told(program, since, "old")

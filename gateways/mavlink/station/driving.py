@@ -73,7 +73,7 @@ def enter(station: Station, mode: RoverMode) -> tuple[Telemetry, ...]:
     """Take a new mode: motion of the one before ends, and GUIDED begins with a neutral, which is none of the stick."""
     stick = station.stick
     stick.channels_us = [CENTRE_US, CENTRE_US]
-    stick.owes = stick.owes or mode is RoverMode.GUIDED
+    stick.needs_neutral = stick.needs_neutral or mode is RoverMode.GUIDED
     moving, stick.last, stick.changed_at = stick.last.moving, _NEUTRAL, station.now
     stick.entered, stick.target_at, stick.live_from = mode is RoverMode.GUIDED, -math.inf, math.inf
     return _drive(station, _NEUTRAL) if moving or stick.entered else ()
@@ -104,10 +104,10 @@ def _move_stick(station: Station, throttle: int, steering: int) -> tuple[Telemet
     stick.axes, stick.heard_at = (throttle, steering), station.now
     forward, right = (_zeroed(station, axis) / _FULL for axis in stick.axes)
     deflected = bool(forward or right)
-    stick.owes = deflected and (stick.owes or not counts)
+    stick.needs_neutral = deflected and (stick.needs_neutral or not counts)
     if not (station.armed and counts):
         return ()
-    if stick.owes:
+    if stick.needs_neutral:
         station.rest(station.now)
         station.warn(RELEASE)
         return ()

@@ -51,7 +51,7 @@ class SaidMotion(msgspec.Struct):
     heard_at: float = -math.inf
     channels_us: list[int] = msgspec.field(default_factory=lambda: [CENTRE_US, CENTRE_US])
     """Throttle and steering of the RC override."""
-    owes: bool = False
+    needs_neutral: bool = False
     """Whether the stick must be released first: it was away from zero, or not heard, when MANUAL was entered."""
     entered: bool = False
     """Whether GUIDED was entered, and no motion has counted since."""

@@ -20,6 +20,10 @@ FORCE_ARM, FORCE_DISARM = 2989.0, 21196.0
 """``param2`` of ARM: without checks; in motion."""
 
 
+M_PER_E7: Final = 0.011131884502145034
+"""Metres of 1e-7 degrees of latitude, as ArduPilot has it."""
+
+
 class RoverMode(IntEnum):
     """Modes of ArduRover, ``custom_mode``."""
 

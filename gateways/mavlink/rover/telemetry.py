@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from gateways.mavlink.messages import MavlinkMessage, telemetry
-from gateways.mavlink.numbers import ARMED, BODY_FRD, Severity
+from gateways.mavlink.numbers import ARMED, BODY_FRD, M_PER_E7, Severity
 from gateways.mavlink.rover.helm import Helm, name_of_mode
 from gateways.mavlink.rover.options import RoverOptions
 from gateways.mavlink.texts import TextJoiner
@@ -17,8 +17,6 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Battery, Motion, Pose, Reading, Scan, Text
 from zbridge.protocol import Kept, ProtocolError, Telemetry
 
-M_PER_UNIT = 0.011131884502145034
-"""Metres of 1e-7 degrees of latitude, as ArduPilot has it."""
 LOCAL_WITHIN_NS = 2_000_000_000
 """How long a local position is awaited before global ones show the pose."""
 UNKNOWN = 65535
@@ -115,9 +113,9 @@ class RoverTelemetry(Kept):
         if self._local or stamp_ns < self._global_since_ns + LOCAL_WITHIN_NS:
             return tuple(readings)
         home_lat, home_lon = self._home = self._home or (lat, lon)
-        east = math.remainder(lon - home_lon, 3.6e9) * M_PER_UNIT * math.cos(math.radians(home_lat / 1e7))
+        east = math.remainder(lon - home_lon, 3.6e9) * M_PER_E7 * math.cos(math.radians(home_lat / 1e7))
         yaw = math.radians(message.hdg / 100) if message.hdg != UNKNOWN else self._yaw
-        return (*readings, *self._pose(east, (lat - home_lat) * M_PER_UNIT, yaw, stamp_ns))
+        return (*readings, *self._pose(east, (lat - home_lat) * M_PER_E7, yaw, stamp_ns))
 
     def home(self, message: telemetry.HomePosition, stamp_ns: int) -> tuple[Telemetry, ...]:
         """Note where global positions are measured from: the first home that is told, not a later one."""

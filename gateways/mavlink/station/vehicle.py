@@ -12,17 +12,16 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
+import numpy.typing as npt
 
 from gateways.mavlink.messages import MavlinkMessage, control, telemetry
-from gateways.mavlink.numbers import BODY_FRD
+from gateways.mavlink.numbers import BODY_FRD, M_PER_E7
 from gateways.mavlink.station.options import MavlinkHqOptions
 from zbridge.fleet.messages import Battery, FleetMessage, Motion, Pose, Scan
 from zbridge.fleet.view import RobotView
 from zbridge.protocol import Kept
 
-M_PER_DEGREE = 111_319.5
-"""Metres of a degree of latitude, as ArduPilot counts."""
-UNKNOWN_16, UNKNOWN_CM = 65535, 65535
+UNKNOWN_16 = 65535
 _POINTS = 72
 _MOST_CM = 65534
 _FIX_3D, _NO_FIX = 3, 1
@@ -113,10 +112,9 @@ class ShownRover(Kept):
             return None
         heading = round(math.degrees(self._compass(pose)) % 360) % 360 if pose is not None else 0
         altitude = origin.altitude if origin is not None else 0.0
-        speed = self._speed_m_s()
-        return telemetry.VfrHud(
-            abs(speed), abs(speed), altitude, 0.0, heading, round(_bounded(self._fraction(), 1)) * 100
-        )
+        fraction = abs(self._fraction())
+        speed, throttle = fraction * self.options.speed_full_m_s, round(100 * min(1.0, fraction))
+        return telemetry.VfrHud(speed, speed, altitude, 0.0, heading, throttle)
 
     def _obstacles(self) -> MavlinkMessage | None:
         scan = self.view.scan
@@ -187,21 +185,18 @@ class ShownRover(Kept):
         origin = self.options.origin
         assert origin is not None
         north, east = self._north_east(pose)
-        latitude = origin.latitude + north / M_PER_DEGREE
-        longitude = origin.longitude + east / (M_PER_DEGREE * math.cos(math.radians(origin.latitude)))
-        return round(_bounded(latitude * _E7, _INT32)), round(_bounded(longitude * _E7, _INT32))
+        latitude = origin.latitude * _E7 + north / M_PER_E7
+        longitude = origin.longitude * _E7 + east / (M_PER_E7 * math.cos(math.radians(origin.latitude)))
+        return round(_bounded(latitude, _INT32)), round(_bounded(longitude, _INT32))
 
     def _fraction(self) -> float:
+        """Return the speed ahead, of full scale."""
         motion = self.view.motion
-        return abs(_finite(motion.speed or 0.0)) if motion is not None else 0.0
-
-    def _speed_m_s(self) -> float:
-        motion = self.view.motion
-        return _finite(motion.speed or 0.0) * self.options.speed_full_m_s if motion is not None else 0.0
+        return _finite(motion.speed or 0.0) if motion is not None else 0.0
 
     def _velocity(self, pose: Pose) -> tuple[float, float]:
         """Return the speed over ground to the north and to the east, m/s."""
-        speed, compass = self._speed_m_s(), self._compass(pose)
+        speed, compass = self._fraction() * self.options.speed_full_m_s, self._compass(pose)
         return speed * math.cos(compass), speed * math.sin(compass)
 
     def _power(self) -> tuple[int, int, int]:
@@ -217,7 +212,7 @@ class ShownRover(Kept):
         )
 
 
-def nearest_cm(scan: Scan, most_cm: int) -> np.ndarray[tuple[int], np.dtype[np.uint16]]:
+def nearest_cm(scan: Scan, most_cm: int) -> npt.NDArray[np.uint16]:
     """Return the nearest range in each 5 degrees, cm, uint16[72], clockwise from ahead; 65535: none was measured.
 
     Beyond ``most_cm`` is nothing: ``most_cm`` + 1.
@@ -229,7 +224,7 @@ def nearest_cm(scan: Scan, most_cm: int) -> np.ndarray[tuple[int], np.dtype[np.u
     nearest = np.full(_POINTS, np.inf)
     np.minimum.at(nearest, sectors[measured], ranges[measured])
     cm = np.where(nearest <= most_cm, np.rint(np.minimum(nearest, most_cm)), most_cm + 1)
-    return np.where(np.isfinite(nearest), cm, UNKNOWN_CM).astype("<u2")
+    return np.where(np.isfinite(nearest), cm, UNKNOWN_16).astype("<u2")
 
 
 def _finite(value: float) -> float:

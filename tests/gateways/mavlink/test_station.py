@@ -203,7 +203,8 @@ def test_a_pose_is_shown_north_east_and_clockwise() -> None:
     assert (local.vx, local.vy) == (pytest.approx(0.25), pytest.approx(0.5 * math.cos(math.radians(30))))
     assert (attitude.yaw, attitude.yawspeed) == (pytest.approx(math.radians(60)), pytest.approx(-0.25))
     assert "GLOBAL_POSITION_INT" not in heard
-    assert heard["VFR_HUD"].heading == 60
+    hud = heard["VFR_HUD"]
+    assert (hud.heading, hud.groundspeed, hud.throttle) == (60, pytest.approx(0.5), 50)
 
 
 @pytest.mark.parametrize(("compass", "north", "east"), [(90.0, 0.0, 10.0), (0.0, 10.0, 0.0), (180.0, -10.0, 0.0)])

@@ -55,16 +55,17 @@ class DatagramLink(Link):
 
     def write(self, data: bytes) -> None:
         """Send ``data`` as one datagram; it is lost, and ``unsent`` called, if the kernel does not accept it now."""
-        for _ in range(2 if self.ready else 0):
+        if not self.ready:
+            return
+        for _ in range(2):
             try:
                 self._socket.send(data)
+                return
             except ConnectionRefusedError:  # of an earlier datagram: this one was not sent
                 self._refused = True
             except OSError:
-                self.unsent()
-                return
-            else:
-                return
+                break
+        self.unsent()
 
     write_datagram = write
 

@@ -210,7 +210,7 @@ class SourceDoor(Door):
             self._calls.cancel()
         super().close()
 
-    def _last(self, links: dict[Address, SourceLink], address: Address, source: Source) -> None:
+    def _renew(self, links: dict[Address, SourceLink], address: Address, source: Source) -> None:
         """Make the link to an address, unless there is one that still leads there."""
         before = links.get(address)
         if before is not None:
@@ -234,5 +234,5 @@ class SourceDoor(Door):
                     unknown.add(address)
                     continue
                 unknown.discard(address)
-                self._last(links, address, found)
+                self._renew(links, address, found)
             await asyncio.sleep(TO_S)

@@ -108,8 +108,8 @@ class RoverSession(MavlinkSession[Any]):
         """Whether the rover's HEARTBEAT is among what was just read."""
 
     def opened(self, now: float) -> None:
-        """Speak first by datagrams: a vehicle does not know yet that we are there."""
-        if self.transport == "udp":
+        """Say that we are there where we speak first by datagrams: the vehicle does not know yet."""
+        if self.speaks_first:
             self.outbox.set(KEEP_ALIVE, (self.encode(_ALIVE),), now, period_s=self.keep_alive.period_s)
 
     # Messages

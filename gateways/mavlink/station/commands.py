@@ -10,7 +10,8 @@ import secrets
 from collections.abc import Callable
 
 from gateways.mavlink.frames import MavlinkFrame
-from gateways.mavlink.messages.control import CommandAck, CommandInt, CommandLong, MavlinkSetMode
+from gateways.mavlink.messages.control import AutopilotVersion, CommandAck, CommandInt, CommandLong, MavlinkSetMode
+from gateways.mavlink.messages.telemetry import HomePosition
 from gateways.mavlink.numbers import CUSTOM_MODE, Command, Result, RoverMode
 from gateways.mavlink.station.driving import RELEASE, enter, is_deflected
 from gateways.mavlink.station.session import Station, StopNews
@@ -26,7 +27,8 @@ STOPPED = ("stopped", "latched")
 STOPPING_S = 1.0
 """Longest wait until a stop is shown, seconds."""
 _US_PER_S = 1e6
-_REQUESTABLE = STREAMED | {148}
+_VERSION, _HOME = AutopilotVersion.spec.id, HomePosition.spec.id
+_REQUESTABLE = STREAMED | {_VERSION}
 """Ids that are sent once where they are asked for."""
 _ACCEPTED: Ordered = (Result.ACCEPTED, ())
 _FAILED: Ordered = (Result.FAILED, ())
@@ -143,10 +145,6 @@ def _set_interval(station: Station, message: CommandLong | CommandInt) -> Ordere
     return _ACCEPTED
 
 
-def _request(station: Station, message: CommandLong | CommandInt) -> Ordered:
-    return _send(station, message.param1)
-
-
 def _send(station: Station, message_id: float) -> Ordered:
     known = station.vehicle.message(int(message_id)) if message_id in _REQUESTABLE else None
     if known is None or not station.there:
@@ -159,8 +157,8 @@ _HANDLERS: dict[int, Callable[[Station, CommandLong | CommandInt], Ordered]] = {
     Command.DO_SET_MODE: _set_mode,
     Command.FLIGHT_TERMINATION: _terminate,
     Command.ARM: _arm,
-    Command.GET_HOME_POSITION: lambda station, message: _send(station, 242),
+    Command.GET_HOME_POSITION: lambda station, message: _send(station, _HOME),
     Command.SET_MESSAGE_INTERVAL: _set_interval,
-    Command.REQUEST_MESSAGE: _request,
-    Command.REQUEST_AUTOPILOT_CAPABILITIES: lambda station, message: _send(station, 148),
+    Command.REQUEST_MESSAGE: lambda station, message: _send(station, message.param1),
+    Command.REQUEST_AUTOPILOT_CAPABILITIES: lambda station, message: _send(station, _VERSION),
 }
